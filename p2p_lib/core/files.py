@@ -19,7 +19,7 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from io import BytesIO
@@ -136,13 +136,31 @@ def load_by_object(path: Path, kind: type[T]) -> dict[str, T]:
         raise BadInput(str(path), f"an archive without {error}", "arrays as p2p run wrote them") from None
 
 
-def check_arrays(what: str, value: Any, shapes: Mapping[str, tuple[int, ...]], finite: bool = False) -> None:
-    """Raise :class:`BadInput` for a field of ``value`` that is no numbers of its shape, or none that are finite."""
+#: What an array holds, and numpy's letters for that.
+_INTEGERS = np.typecodes["AllInteger"]
+_LETTERS = {"numbers": _INTEGERS + np.typecodes["Float"], "whole numbers": _INTEGERS, "bytes": "B", "yes or no": "?"}
+
+
+def check_arrays(what: str, of: Any, kind: str, /, *, finite: bool = True, **shapes: tuple[int | None, ...]) -> None:
+    """Raise :class:`BadInput` for a field that is no array of this kind and shape (None: any length), all finite.
+
+    kind    ``numbers``, ``whole numbers``, ``bytes`` or ``yes or no``
+    finite  False where NaN stands for what is not known
+    """
     for key, shape in shapes.items():
-        got = getattr(value, key)
-        if got.shape != shape or got.dtype.kind not in "iufb" or (finite and not np.isfinite(got).all()):
-            expected = f"{'finite ' * finite}numbers {shape}"
-            raise BadInput(f"{what}: {key}", f"{got.dtype} {got.shape}", expected)
+        got, expected = getattr(of, key), f"{kind} {of_shape(shape) or 'alone'}"
+        if not isinstance(got, np.ndarray):
+            raise BadInput(f"{what}: {key}", "no array", expected)
+        fits = len(shape) == got.ndim and all(w in (None, n) for w, n in zip(shape, got.shape, strict=True))
+        if not fits or got.dtype.char not in _LETTERS[kind]:
+            raise BadInput(f"{what}: {key}", f"{got.dtype} {of_shape(got.shape) or 'alone'}", expected)
+        if finite and not np.isfinite(got).all():
+            raise BadInput(f"{what}: {key}", "some that are not finite", f"finite {expected}")
+
+
+def of_shape(shape: Iterable[int | None]) -> str:
+    """A shape in words; None is any length."""
+    return " x ".join("any" if n is None else str(n) for n in shape)
 
 
 def file_name(what: str, name: object) -> str:

@@ -6,7 +6,7 @@ A memory is of the object alone. It is metric, so that another camera, another p
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.files import file_name, load_arrays, parse_json, read_text, save_arrays
+from p2p_lib.core.files import check_arrays, file_name, load_arrays, of_shape, parse_json, read_text, save_arrays
 
 #: Of the files that this library writes, and reads.
 VERSION = 2
@@ -30,9 +30,6 @@ _POSE_TOLERANCE = 5e-3
 _FARTHEST_M, _BESIDE = 100.0, 10
 #: Above the weight that is written.
 _MOST_WEIGHT = 1e6
-#: What an array holds, and numpy's letters for that.
-_INTEGERS = np.typecodes["AllInteger"]
-_LETTERS = {"numbers": _INTEGERS + np.typecodes["Float"], "whole numbers": _INTEGERS, "bytes": "B"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +58,17 @@ class SurfaceMemory:
 
     def __post_init__(self) -> None:
         what = "memory surface"
-        _check(what, self, "numbers", voxel_m=(), tau_m=(), origin_m=(3,))
-        _check(what, self, "whole numbers", lo=(3,), shape=(3,), index=(None,))
+        check_arrays(what, self, "numbers", voxel_m=(), tau_m=(), origin_m=(3,))
+        check_arrays(what, self, "whole numbers", lo=(3,), shape=(3,), index=(None,))
         m = len(self.index)
-        _check(what, self, "numbers", value=(m,), weight=(m,), rgb_weight=(m,))
-        _check(what, self, "bytes", rgb=(m, 3))
+        check_arrays(what, self, "numbers", value=(m,), weight=(m,), rgb_weight=(m,))
+        check_arrays(what, self, "bytes", rgb=(m, 3))
         voxels = np.prod(self.shape.astype(float))
         if not (0 < float(self.voxel_m) < 1 and 0 < float(self.tau_m) < 1 and (self.shape > 1).all()):
-            got = f"{_of(self.shape)} voxels of {self.voxel_m} m, which end {self.tau_m} m from the surface"
+            got = f"{of_shape(self.shape)} voxels of {self.voxel_m} m, which end {self.tau_m} m from the surface"
             raise BadInput(what, got, "a grid of voxels")
         if voxels >= 1 << 31:
-            raise BadInput(what, f"{_of(self.shape)} voxels", "as many as a computer holds")
+            raise BadInput(what, f"{of_shape(self.shape)} voxels", "as many as a computer holds")
         if np.abs(self.corners_m).max() > _FARTHEST_M:
             raise BadInput(what, f"voxels {np.abs(self.corners_m).max():.3g} m away", "metres, near the object frame")
         index = self.index.astype(np.int64)
@@ -125,14 +122,14 @@ class ObjectMemory:
 
     def __post_init__(self) -> None:
         what = f"memory of {file_name('memory name', self.name)!r}"
-        _check(what, self, "numbers", p_obj=(None, 3), T_cam_obj=(None, 4, 4), covariance=(6, 6), seen_m2=())
+        check_arrays(what, self, "numbers", p_obj=(None, 3), T_cam_obj=(None, 4, 4), covariance=(6, 6), seen_m2=())
         n, v = len(self.p_obj), len(self.T_cam_obj)
         if not n or not v:
             fix = "Learn the object from more or sharper frames, or with more texture."
             got, expected = f"{n} landmarks and {v} keyframes", "an object that can be found again by them"
             raise BadInput(what, got, expected, fix)
-        _check(what, self, "bytes", descriptors=(n, *DESCRIPTOR))
-        _check(what, self, "numbers", confidence=(n,))
+        check_arrays(what, self, "bytes", descriptors=(n, *DESCRIPTOR))
+        check_arrays(what, self, "numbers", confidence=(n,))
         _check_between(f"{what}: confidence", self.confidence, 0, 1)
         _check_between(f"{what}: seen_m2", self.seen_m2, 0, _FARTHEST_M**2)
         for T in self.T_cam_obj:
@@ -147,23 +144,6 @@ class ObjectMemory:
         if not _is_covariance(self.covariance):
             raise BadInput(f"{what}: covariance", "no covariance", "a symmetric matrix without negative variances")
         _check_origins(what, self.made_of)
-
-
-def _check(what: str, of: Any, kind: str, /, **shapes: tuple[int | None, ...]) -> None:
-    """Raise :class:`BadInput` for a field that is no array of this kind and shape (None: any length), all finite."""
-    for key, shape in shapes.items():
-        got, expected = getattr(of, key), f"{kind} {_of(shape) or 'alone'}"
-        if not isinstance(got, np.ndarray):
-            raise BadInput(f"{what}: {key}", "no array", expected)
-        fits = len(shape) == got.ndim and all(w in (None, n) for w, n in zip(shape, got.shape, strict=True))
-        if not fits or got.dtype.char not in _LETTERS[kind]:
-            raise BadInput(f"{what}: {key}", f"{got.dtype} {_of(got.shape) or 'alone'}", expected)
-        if not np.isfinite(got).all():
-            raise BadInput(f"{what}: {key}", "some that are not finite", f"finite {expected}")
-
-
-def _of(shape: Iterable[int | None]) -> str:
-    return " x ".join("any" if n is None else str(n) for n in shape)
 
 
 def _check_between(what: str, values: np.ndarray, least: float, most: float) -> None:

@@ -35,8 +35,9 @@ class ObjectKeypoints:
 
     def __post_init__(self) -> None:
         n, m = len(self.ids), len(self.frame_index)
-        of_map = {"ids": (n,), "p_obj": (n, 3), "promoted": (n,)}
-        check_arrays("keypoints", self, of_map | {"frame_index": (m,), "track_id": (m,), "uv_px": (m, 2)})
+        check_arrays("keypoints", self, "whole numbers", ids=(n,), frame_index=(m,), track_id=(m,))
+        check_arrays("keypoints", self, "numbers", p_obj=(n, 3), uv_px=(m, 2), finite=False)
+        check_arrays("keypoints", self, "yes or no", promoted=(n,))
 
     def at(self, frame: int) -> slice:
         """The rows of observations of one frame."""

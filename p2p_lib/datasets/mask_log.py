@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import check_arrays, load_by_object, save_arrays
 from p2p_lib.core.types import Frame
 
@@ -48,10 +47,9 @@ class ObjectMasks:
 
     def __post_init__(self) -> None:
         n = len(self.frame_index)
-        shapes = {"frame_index": (n,), "px": (n,), "box": (n, 4), "size_m": (n,), "centre_m": (n, 3)}
-        check_arrays("masks", self, shapes)
-        if self.bits.dtype != np.uint8 or self.bits.shape != (self._ends[-1],):
-            raise BadInput("masks: bits", f"shape {self.bits.shape} {self.bits.dtype}", f"{self._ends[-1]} bytes")
+        check_arrays("masks", self, "whole numbers", frame_index=(n,), px=(n,), box=(n, 4))
+        check_arrays("masks", self, "numbers", size_m=(n,), centre_m=(n, 3), finite=False)
+        check_arrays("masks", self, "bytes", bits=(int(self._ends[-1]),))
 
     @property
     def _ends(self) -> np.ndarray:

@@ -83,7 +83,6 @@ def _prompt(given: Any, folder: Path | None) -> Prompt:
         if folder is None or not isinstance(given["mask"], str):
             raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], "an image beside the prompts")
         mask = read_image(folder / given["mask"], cv2.IMREAD_GRAYSCALE, "a mask image") > 0
-    file_name("object name", given["name"])
     called = {"points_px": "points", "negative_px": "negative", "box_px": "box"}
     fields: dict[str, Any] = {field: given[key] for field, key in called.items() if given.get(key) is not None}
     return Prompt(given["name"], given.get("frame", 0), **fields, mask=mask)

@@ -3,7 +3,7 @@
 Causal, frame by frame: a memory of the object's last frames and of the one with the clicks conditions the mask in
 the next. Code and weights: Apache-2.0. Each object has an inference session of its own, so that it can come late and
 go; the image's features, which are most of the work, are computed once for all of them. Last run with transformers
-5.23.0.
+5.24.0.
 """
 
 from __future__ import annotations
