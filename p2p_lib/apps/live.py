@@ -22,7 +22,6 @@ from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
-from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.memory import load_memories
@@ -64,35 +63,6 @@ class LiveCount:
     def __str__(self) -> str:
         rate = f" ({self.frames / self.seconds:.1f} Hz)" if self.seconds else ""
         return f"{self.frames} frames in {self.seconds:.1f} s{rate}, {self.dropped} dropped"
-
-
-@dataclass
-class _Until:
-    """A camera up to its image ``stop``: none from there on is read, to push one before it out of the backlog."""
-
-    source: LiveCamera
-    stop: float
-    reached: bool = False
-
-    @property
-    def name(self) -> str:
-        """The camera's."""
-        return self.source.name
-
-    @property
-    def camera(self) -> Camera:
-        """The camera's."""
-        return self.source.camera
-
-    def read(self) -> Frame | None:
-        """Its next frame; None at its end, and from ``stop`` on, which was ``reached`` then."""
-        frame = self.source.read()
-        self.reached = frame is not None and frame.index >= self.stop
-        return None if self.reached else frame
-
-    def close(self) -> None:
-        """Stop the camera."""
-        self.source.close()
 
 
 def track_live(
@@ -164,8 +134,8 @@ def track_live(
                     listen(of, estimates)
 
         start_s = monotonic()
-        until = _Until(camera, math.inf if options.stop is None else options.stop)
-        newest = kept.enter_context(Newest(until, {p.frame for p in prompts}, backlog))
+        stop = math.inf if options.stop is None else options.stop
+        newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog, stop))
         frame = first or newest.take()
         while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
@@ -176,7 +146,7 @@ def track_live(
                 count.count(frame)
             count.seconds = monotonic() - start_s
             frame = newest.take()
-        if until.reached and options.stop is not None:
+        if newest.stopped and options.stop is not None:
             count.until(options.stop)
         for estimates in method.finish():
             tell(estimates)

@@ -6,6 +6,7 @@ so that a tracker that is slower than the camera skips frames instead of falling
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -164,10 +165,12 @@ class Newest:
 
     keep     indices of frames that are not dropped
     backlog  how many others wait behind the next one; where more do the oldest is dropped
+    stop     the index from which on none is read, to push one before it out; ``stopped`` says that it came
     """
 
-    def __init__(self, source: LiveCamera, keep: Collection[int] = (), backlog: int = 0):
+    def __init__(self, source: LiveCamera, keep: Collection[int] = (), backlog: int = 0, stop: float = math.inf):
         self._source, self._keep, self._most = source, frozenset(keep), backlog + 1
+        self._stop, self.stopped = stop, False
         self._waiting: deque[Frame] = deque()
         self._changed, self._ended = Condition(), False
         self._pool = ThreadPoolExecutor(1)
@@ -192,6 +195,9 @@ class Newest:
     def _grab(self) -> None:
         try:
             while (frame := self._source.read()) is not None:
+                if frame.index >= self._stop:
+                    self.stopped = True
+                    return
                 with self._changed:
                     self._waiting.append(frame)
                     idle = [waits for waits in self._waiting if waits.index not in self._keep]
