@@ -104,11 +104,13 @@ def test_points_that_leave_one_by_one_are_no_segment():
     assert not p.verified[:8].any() and len(segments.segments) == 1
 
 
-def half_lost(monkeypatch, shift_px: float, pairs: int) -> tuple[Points, motion_segments.MotionSegments]:
-    """Eight of 25 points are followed, where they were; so many corners of the frame before match, moved."""
+def half_lost(
+    monkeypatch, shift_px: float, pairs: int, followed: int = 8
+) -> tuple[Points, motion_segments.MotionSegments]:
+    """So many of 25 points are followed, where they were; so many corners of the frame before match, moved."""
     p, segments = started(RIGHT, image())
     segments.remember(p, image(), None)
-    p.verified[8:] = False
+    p.verified[followed:] = False
     T_cam_seg = segments.segments[0].fit.T_cam_seg.copy()
     T_cam_seg[0, 3] += shift_px * PX_M
     own, found = slice(8, 8 + pairs), segments.segments[0].last_view.corners
@@ -123,11 +125,28 @@ def half_lost(monkeypatch, shift_px: float, pairs: int) -> tuple[Points, motion_
     ids=["lost", "no more agree", "lost for long", "rejected"],
 )
 def test_a_segment_is_matched_that_was_just_lost(monkeypatch, state, pairs, matched):
-    p, segments = half_lost(monkeypatch, 0, pairs)
+    p, segments = half_lost(monkeypatch, 30, pairs)
     for name, frames in state.items():
         setattr(segments.segments[0], name, frames)
     segments.fit(p, image())
     assert (segments.segments[0].matched is not None) == matched
+
+
+@pytest.mark.parametrize(("shift_px", "followed", "matched"), [(2, 8, False), (2, 5, True), (30, 8, True)])
+def test_of_a_short_step_matches_say_nothing_where_points_are_followed(monkeypatch, shift_px, followed, matched):
+    """A reflection stands still while its object turns: its corners agree with hardly any motion."""
+    p, segments = half_lost(monkeypatch, shift_px, 12, followed)
+    segments.fit(p, image())
+    assert (segments.segments[0].matched is not None) == matched
+
+
+def test_where_points_and_matches_about_agree_the_pose_is_that_of_the_points(monkeypatch):
+    p, segments = half_lost(monkeypatch, 30, 12)
+    p.uv[:8] += [34, 0]
+    segments.fit(p, image())
+    (segment,) = segments.segments
+    assert segment.matched is not None and p.verified[:8].all()
+    assert segment.fit.T_cam_seg[0, 3] == pytest.approx(34 * PX_M, abs=0.3 * PX_M)
 
 
 def test_what_is_left_behind_by_a_match_does_not_leave_as_a_segment(monkeypatch):

@@ -124,10 +124,14 @@ class MotionSegments:
         rows = [np.flatnonzero(p.verified & (p.segment == s)) for s in range(len(self.segments))]
         for segment in self.segments:
             segment.rejected_for, segment.matched = max(segment.rejected_for - 1, 0), None
-        fits = [self._fitted(segment, p, at, now) for segment, at in zip(self.segments, rows, strict=True)]
+        fits = [self._fitted(segment.extrapolated, p, at, now) for segment, at in zip(self.segments, rows, strict=True)]
         self._match(fits, now, search)
         for segment, at, fit in zip(self.segments.copy(), rows, fits, strict=True):
-            fit = self._fitted(segment, p, at, now) if segment.matched else fit
+            if (pairs := segment.matched) is not None:
+                start = pairs.T_cam_seg
+                if fit is not None and self._same(fit.T_cam_seg, start, fit.centre):
+                    start = fit.T_cam_seg
+                fit = self._fitted(start, p, at, now, pairs=pairs)
             if fit is None:
                 segment.hidden_for += 1
                 continue
@@ -150,7 +154,8 @@ class MotionSegments:
                 if len(at) < MIN_FOUND * shown:
                     segment.hidden_for, p.verified[at] = 1, False
                 continue
-            fit = self._fitted(segment, p, at, now, fewest * shown)
+            least = fewest * shown if segment.matched is None else 0.0
+            fit = self._fitted(segment.fit.T_cam_seg, p, at, now, least, segment.matched)
             if fit is not None:
                 segment.before = segment.before if segment.posed else fit.T_cam_seg
                 segment.fit, segment.hidden_for = fit, 0
@@ -159,13 +164,17 @@ class MotionSegments:
                 p.verified[own] = False
 
     def _fitted(
-        self, segment: MotionSegment, p: Points, at: np.ndarray, now: Image, fewest: float = 0.0
+        self,
+        start: np.ndarray,
+        p: Points,
+        at: np.ndarray,
+        now: Image,
+        fewest: float = 0.0,
+        pairs: Matched | None = None,
     ) -> PoseFit | None:
-        """The pose of a segment by its points at these rows, and by the corners matched: None where too few agree."""
-        start, pairs = segment.extrapolated, segment.matched
+        """A segment's pose, near ``start``, by its points at these rows and by ``pairs``; None where few agree."""
         seen = [p.p_seg[at], p.map_cov[at], p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])]
         if pairs is not None:
-            start, fewest = pairs.T_cam_seg, 0.0
             noise_m2, noise_px2 = (np.repeat(cov[None], len(pairs), 0) for cov in (_MATCHED_M2, _MATCHED_PX2))
             more = pairs.p_seg, noise_m2, pairs.uv_px, noise_px2, pairs.z_m
             seen = [np.concatenate(column) for column in zip(seen, more, strict=True)]
@@ -177,7 +186,11 @@ class MotionSegments:
         return replace(fit, agrees=fit.agrees[: len(at)]) if fit.agrees.sum() >= fewest else None
 
     def _match(self, fits: list[PoseFit | None], now: Image, search: np.ndarray | None) -> None:
-        """Look for corners of segments on which too few points were followed; kept where more of them agree."""
+        """Look for corners of segments on which too few points were followed; kept where more of them agree.
+
+        Not where they have hardly moved: reflections stand still while their object turns, and agree with that. Points,
+        if there are some, tell a short step better.
+        """
         agreeing = [0 if fit is None else np.count_nonzero(fit.agrees) for fit in fits]
         lost = [
             (segment, count, segment.last_view)
@@ -192,7 +205,15 @@ class MotionSegments:
         found, regions = corners_of([then for _, _, then in lost], now, search)
         for (segment, count, then), region in zip(lost, regions, strict=True):
             pairs = matched(then, found.select(in_mask(found.uv_px, region)), self.config, self._rng)
-            segment.matched = pairs if pairs is not None and len(pairs) > count else None
+            if pairs is None or len(pairs) <= count:
+                continue
+            still = self._same(pairs.T_cam_seg, then.T_cam_seg, segment.fit.centre)
+            if not (still and count >= MIN_FOUND * len(then.uv_px)):
+                segment.matched = pairs
+
+    def _same(self, T_a: np.ndarray, T_b: np.ndarray, centre: np.ndarray) -> bool:
+        """Whether two poses of a segment differ by less than points that agree."""
+        return pose_distance_m(T_a, T_b, centre) < self.config.segment_inlier_m
 
     def remember(self, p: Points, now: Image, search: np.ndarray | None) -> None:
         """Where segments show in the newest frame: there they are searched for in the next one."""
