@@ -147,6 +147,8 @@ def test_where_points_and_matches_about_agree_the_pose_is_that_of_the_points(mon
     (segment,) = segments.segments
     assert segment.matched is not None and p.verified[:8].all()
     assert segment.fit.T_cam_seg[0, 3] == pytest.approx(34 * PX_M, abs=0.3 * PX_M)
+    segments.fit_found(p, image(), np.arange(8, 25), motion_segments.MIN_FOUND)
+    assert segment.fit.T_cam_seg[0, 3] == pytest.approx(34 * PX_M, abs=0.3 * PX_M)
 
 
 def test_what_is_left_behind_by_a_match_does_not_leave_as_a_segment(monkeypatch):
