@@ -5,8 +5,9 @@ THREADS ?= 1
 export OMP_NUM_THREADS := $(THREADS)
 export OPENBLAS_NUM_THREADS := $(THREADS)
 export MKL_NUM_THREADS := $(THREADS)
-# ROS and others put packages of another Python there.
-unexport PYTHONPATH PYTHONHOME
+# ROS and others put packages of another Python there; and where Python may keep no bytecode, as in many containers,
+# every process compiles its packages anew, which takes half of a short one's time.
+unexport PYTHONPATH PYTHONHOME PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup reproduce book test release test-backends test-ros docs mutants seeds bench lab figures lock
 help: ## this list

@@ -91,13 +91,13 @@ def run_notebooks(
     folder: Path | None = None,
     say: Callable[[str], None] = print,
 ) -> list[NotebookResult]:
-    """Run the notebooks in order and write executed copies, pages, images, tables and a gallery.
+    """Run the notebooks, write executed copies, pages, images, tables and a gallery.
 
     only        numbers or names of notebooks; all by default
     out         folder of the results, default ``out/<profile>``, beside it with other parameters, named by them; images
                 of the full profile go to ``figures/`` by default.
                 Notebooks find their folders in ``$P2P_FIGURES``, ``$P2P_TABLES`` and ``$P2P_RUNS``
-    jobs        how many run at a time
+    jobs        how many run at a time; one: in order, more: from the last one on
     parameters  of the notebooks, besides ``PROFILE``; a string is read as the kind of value the notebook has
     folder      where the notebooks are, default ``notebooks/`` of the project
     say         is told of progress, line by line
@@ -130,10 +130,14 @@ def run_notebooks(
     results: list[NotebookResult] = []
     kernels: list[Any] = []
     pool = ThreadPoolExecutor(jobs)
-    runs = [pool.submit(_run_one, path, home, values, _kernel_manager(places, kernels), say) for path, values in plans]
+    # The long ones are among the last, and what begins last should be short: in the end it runs alone.
+    order = plans if jobs == 1 else plans[::-1]
+    runs = {
+        path: pool.submit(_run_one, path, home, values, _kernel_manager(places, kernels), say) for path, values in order
+    }
     try:
-        for future in runs:
-            results.append(future.result())
+        for path in paths:
+            results.append(runs[path].result())
             if results[-1].error:
                 page = _near(results[-1].executed.with_suffix(".html"))
                 raise NotebookFailed(f"notebook {results[-1].name}, {results[-1].error}. See {page}")
