@@ -215,10 +215,9 @@ _INDEX = """# The paper's figures and tables
 
 Written by `p2p figures`. *Made on* says whether what is here is of the paper's data, of a re-creation of it,
 or of a stand-in, which carries the word in the picture. Tables of data that was not there hold the paper's
-numbers and, for ours, dashes with the reason: what was measured on such data before is in the project's
-[README](../README.md). `make figures` makes all of it from what is on disk; `p2p benchmark --list` says what
-can run here. *Earlier code*: what decides the numbers has changed since; `p2p benchmark --stale` lists these with
-the minutes they take, and makes them anew with `--out DIR`.
+numbers and, for ours, dashes with the reason. `make figures` makes all of it from what is on disk;
+`p2p benchmark --list` says what can run here. *Earlier code*: what decides the numbers has changed since;
+`p2p benchmark --stale` lists these with the minutes they take, and makes them anew with `--out DIR`.
 
 """
 

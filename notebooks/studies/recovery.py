@@ -84,7 +84,7 @@ def strip(scenes: Mapping[str, Scene], name: str, shown: Mapping[str, int], said
             axis.set(xticks=[], yticks=[])
             axis.set_xlabel(scene.run.objects[name].status[at], fontsize=10)
             if said is not None:
-                why = fill(said.reason[at], 150 // len(shown))
+                why = fill(said.reason[at], 126 // len(shown))
                 axis.set_xlabel(f"{said.status[at]}, map {said.map_id[at]}\n{why}", fontsize=7.5, va="top")
             axis.spines[:].set_visible(False)
         row[0].set_ylabel(label, fontweight="bold")

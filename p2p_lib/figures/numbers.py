@@ -20,7 +20,6 @@ METRICS = {
 #: Those of them that are areas under the curve, and the heads of these.
 AREA_KEYS = ("adds_auc", "add_auc")
 AREA_HEADS = [METRICS[key][1] for key in AREA_KEYS]
-_HOW = "exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
 _REPORTED = "(reported): as the paper prints it, on its own files, masks and machine"
 
 
@@ -31,6 +30,8 @@ def is_whole_dataset(job: Job) -> bool:
 
 class Numbers:
     """The summary of a benchmark, looked up by what a cell is of: failures count as 0, aligned at the first frame."""
+
+    HOW = "exact area under the curve, aligned at the first scored frame, frames without a pose count as 0"
 
     def __init__(self, benchmark: Benchmark):
         self.benchmark, self.plan = benchmark, benchmark.plan
@@ -51,7 +52,13 @@ class Numbers:
     def cell(self, method: str, metric: str, sequence: str, object: str = "", form: str = "exact") -> Cell:
         """The number over seeds as a cell; where there is none it says why."""
         row = self.row(method, metric, sequence, object, form)
-        return self.missing(method, sequence) if row is None else number(row["value"], row.get("std"))
+        if row is None:
+            return self.missing(method, sequence)
+        return replace(number(row["value"], row.get("std")), note=self.of_fewer(len(row["seeds"].split())))
+
+    def of_fewer(self, seeds: int) -> str:
+        """What to say of a number behind which are fewer seeds than planned, for a run of theirs has no score."""
+        return f"of {seeds} of {len(self.seeds)} seeds" if seeds < len(self.seeds) else ""
 
     def mean(self, method: Method, metric: str) -> Cell:
         """The mean over sequences, and how many these are of; where nothing ran, the reason that the first gave."""
@@ -61,7 +68,8 @@ class Numbers:
         if self.row(method.name, metric, MEAN) is None:
             return self.nothing_ran(method)
         note = f"{len(ran)} of {len(planned)} sequences" if len(ran) < len(planned) else ""
-        return replace(self.cell(method.name, metric, MEAN), note=note)
+        cell = self.cell(method.name, metric, MEAN)
+        return replace(cell, note="; ".join(filter(None, [note, cell.note])))
 
     def nothing_ran(self, method: Method) -> Cell:
         """A dash, or ``fail``, for a method of which nothing ran, with the reason that its first run gave."""
@@ -87,7 +95,7 @@ class Numbers:
         seeds = ", ".join(map(str, self.seeds))
         spread = f"mean ± standard deviation over seeds {seeds}" if len(self.seeds) > 1 else f"seed {seeds} alone"
         reported = [_REPORTED] if self.plan.paper else []
-        how = f"Ours: {_HOW}" if reported else _HOW.capitalize()
+        how = f"Ours: {self.HOW}" if reported else self.HOW.capitalize()
         return [f"{how}; {self.scored()}; {spread}", *self.about(), *reported]
 
     def scored(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 from pandas import DataFrame
@@ -23,6 +24,8 @@ def by_run(numbers: Numbers) -> Table:
     lines = []
     for at, outcomes in _scored(numbers).items():
         cells = _run_cells(outcomes) if outcomes else [numbers.missing(*at)] * 6
+        if outcomes:
+            cells[0] = replace(cells[0], note=numbers.of_fewer(len(outcomes)))
         rate = [number(hz[at], digits=1) if at in hz else numbers.missing(*at)] * numbers.judges
         lines.append([Cell(at[0]), Cell(at[1]), *cells, *rate])
     heads = ["Method", "Sequence", *2 * AREA_HEADS, "frames lost", "returns", *["rate (Hz)"] * numbers.judges]
@@ -72,7 +75,8 @@ def by_grid(numbers: Numbers) -> Table:
     groups = [("", 1), *((preset, presets.count(preset)) for preset in dict.fromkeys(presets))]
     how = "ADD-S / ADD area under the curve (%), in brackets frames lost of all objects; the mean is over sequences on "
     how += "which every method ran"
-    notes = [how, *numbers.notes()]
+    over = f"mean over seeds {', '.join(map(str, numbers.seeds))}" if len(numbers.seeds) > 1 else "one seed"
+    notes = [how, f"{numbers.HOW.capitalize()}; {numbers.scored()}; {over}", *numbers.about()]
     return Table(numbers.plan.title, ["Sequence", *trackers], lines, groups, rules=rules, notes=notes)
 
 

@@ -120,13 +120,12 @@ def test_a_re_creation_is_never_compared_with_the_papers_numbers(tmp_path):
     jobs = []
     for planned in (planned for planned in plan.full.sequence if method.runs_on(planned.name)):
         objects = {n: ObjectOutcome(lost=0, first=scored, all=scored, returns=[]) for n in planned.columns}
-        jobs.append(
-            (Job(method, planned, 0, "poses", False, key="k"), outcome(99.9).model_copy(update={"objects": objects}))
-        )
+        one = outcome(99.9).model_copy(update={"objects": objects})
+        jobs += [(Job(method, planned, seed, "poses", False, key="k"), one) for seed in plan.full.seeds]
     table = paper_table(Benchmark(plan, "full", tmp_path, tuple(jobs)))
     at = [k for k, head in enumerate(table.heads) if head == method.name]
     mine = [row[k] for row in table.rows for k in at]
-    assert {cell.text for cell in mine} == {"99.90"} and not any(cell.bold for cell in mine)
+    assert {cell.text for cell in mine} == {"99.90 ± 0.00"} and not any(cell.bold for cell in mine)
     assert {cell.note for row in table.rows[:-1] for cell in [row[at[0]]]} == {"re-created, not the paper's files"}
     reported = [k for k, head in enumerate(table.heads) if head == "Point2Pose (reported)"]
     assert table.rows[-1][reported[0]].bold, "the paper's own stays the best of what is compared"
@@ -162,6 +161,7 @@ def test_a_grid_has_a_row_per_sequence_and_the_mean_of_those_that_all_methods_ra
     assert first == ["ycbineoat/bleach0", "85.0 / 85.0 (0)", "99.0 / 99.0 (0)"]
     assert second == ["ycbineoat/mustard0", "70.0 / 70.0 (0)", "-"]
     assert mean == ["mean of 1", *first[1:]]
+    assert any("; mean over seeds 0, 1" in note for note in table.notes) and "±" not in str(table.notes)
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
@@ -190,6 +190,17 @@ def test_seeds_show_their_spread(tmp_path):
     table = paper_table(benchmark(tmp_path, runs, seeds=(0, 1, 2), **INEOAT))
     assert cell(table, "bleach v1", "ADD (%)", "CAD-free", "Ours").text == "92.00 ± 2.00"
     assert any("over seeds 0, 1, 2" in note for note in table.notes)
+
+
+def test_a_number_of_fewer_seeds_than_planned_says_so(tmp_path):
+    absent = Outcome(key="k", status="not run", reason="killed")
+    runs = {("Ours", "bleach0"): [outcome(90, 663), outcome(94, 663), absent]}
+    table = paper_table(benchmark(tmp_path, runs, seeds=(0, 1, 2), **INEOAT))
+    assert cell(table, "bleach v1", "ADD (%)", "CAD-free", "Ours").note == "of 2 of 3 seeds"
+    (row,) = paper_table(benchmark(tmp_path, runs, seeds=(0, 1, 2), kind="runs")).rows
+    assert (row[2].text, row[2].note) == ("92.0 (90.0 to 94.0)", "of 2 of 3 seeds")
+    (row,) = paper_table(benchmark(tmp_path, {("Ours", "a"): [outcome(90)]}, kind="runs")).rows
+    assert row[2].note == ""
 
 
 def test_latex_has_groups_rules_and_notes():
