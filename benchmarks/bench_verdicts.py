@@ -24,6 +24,7 @@ from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.consistency import consistency
 from p2p_lib.evaluation.protocol import evaluate
+from p2p_lib.extended.gates import DOUBTS, GATES
 from p2p_lib.run import run
 
 #: By ADD-S and ADD: good from the first on, bad below the second, and not counted between.
@@ -37,7 +38,8 @@ SYNTHETIC, TABLE, EARLY, DESK = (
 MUSTARD, HAND = "ycbineoat/mustard0_first400", "real_hand/mug_in_hand"
 LK = {"tracker": "lk", "preset": "paper"}
 SHORT = {"preset": "paper", "settings": {"tracking.forget_after": "10"}}
-NO_GATES = {"settings": {"method.gates": "none"}}
+#: Nothing refuses a pose, and nothing keeps a doubted one from being learnt from.
+NO_GATES = {"settings": {"method.mechanisms": f"all but {', '.join([*GATES, *DOUBTS])}"}}
 CLICKS = {"masks": "clicks"}
 WRONG = "bad"
 #: Of the runs that were read.

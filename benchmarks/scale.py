@@ -40,8 +40,9 @@ the 95th percentile, and in processor time of all threads in the mean. Below 1 o
 | 2D tracker | OpenCV's Lucas-Kanade, checked forward and backward |
 
 What mechanisms are worth in accuracy is in [mechanisms.md](mechanisms.md), what memories of objects find again in
-[recall.md](recall.md) (`bench_recall.py`). `bench_offline.py` measures what `p2p refine` is worth, and `bench_hand.py`
-a mug that a hand turns; each writes a page of its own here.
+[recall.md](recall.md) (`bench_recall.py`). `bench_offline.py` measures what `p2p refine` is worth, `bench_hand.py`
+a mug that a hand turns, `bench_first_masks.py` the masks that clicks start objects with, and `bench_features.py` what
+learned features would gain; each writes a page of its own here.
 
 """
 

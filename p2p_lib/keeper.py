@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.errors import Doubt
+from p2p_lib.core.errors import Doubt, Doubts
 from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
@@ -38,7 +38,7 @@ class Keeper:
     masks     whether to keep the masks as images
     prompts   what started the objects, to be drawn with their first masks
     sizes_m   how long objects are known to be
-    doubts    what was doubted meanwhile: a list that the caller fills (:func:`noted`)
+    doubts    what was doubted meanwhile, which the caller fills (:func:`noted`)
     followed  what followed each object: one tracker, and one more each time that it was added again after its removal.
               What was removed is as it was then
     """
@@ -48,7 +48,7 @@ class Keeper:
     masks: bool = False
     prompts: Iterable[Prompt] = ()
     sizes_m: Mapping[str, float] = field(default_factory=dict)
-    doubts: list[str] = field(default_factory=list)
+    doubts: Doubts = field(default_factory=Doubts)
     keypoints: KeypointLog = field(default_factory=KeypointLog)
     followed: dict[str, list[Any]] = field(default_factory=dict)
 
@@ -98,7 +98,7 @@ class Keeper:
 
         sequence  whose images are looked at; None where they are gone
         """
-        self.writer.info["doubts"] = list(dict.fromkeys(self.doubts))
+        self.writer.info["doubts"] = list(self.doubts)
         self.writer.flush()
         seen, looks = (Stream("", self.method.camera), 0) if sequence is None else (sequence, RUN_LOOKS)
         found = consistency(load_run(self.writer.path), seen, looks, self.sizes_m)
@@ -106,13 +106,13 @@ class Keeper:
 
 
 @contextmanager
-def noted(doubts: list[str]) -> Iterator[None]:
+def noted(doubts: Doubts) -> Iterator[None]:
     """Keeps what is doubted inside (:class:`~p2p_lib.core.errors.Doubt`), which is shown as before."""
     shown = warnings.showwarning
 
     def note(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
         if issubclass(category, Doubt):
-            doubts.append(str(message))
+            doubts.add(str(message))
         shown(message, category, *where, **how)
 
     warnings.showwarning = note

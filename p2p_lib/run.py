@@ -15,8 +15,9 @@ import numpy as np
 
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, doubt
-from p2p_lib.core.memory import ObjectMemory, load_memories
+from p2p_lib.core.depth import in_range
+from p2p_lib.core.errors import BadInput, Doubts, MissingData, P2PError, advised, doubt
+from p2p_lib.core.memory import ObjectMemory, far_fewer_pixels, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar, waiting_for
 from p2p_lib.core.prompts import Prompt
@@ -24,6 +25,7 @@ from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_t
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
+from p2p_lib.datasets.depth_units import beyond, distance_m
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.models import find_models, given_models
@@ -39,6 +41,10 @@ from p2p_lib.keeper import Keeper, noted
 
 #: So many clicks an object are drawn from its first mask.
 CLICKS = 3
+#: Fraction of a first mask: if less is in range, depth is most likely in another unit.
+_HARDLY = 0.02
+#: What to do where the frame of a prompt cannot be read.
+_NEEDED = "A prompt needs this frame. Click in another one (p2p click), or give a mask of one."
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ def run(
     and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
-    doubts: list[str] = []
+    doubts = Doubts()
     with waiting_for("Reading the sequence", progress), noted(doubts):
         job = _prepare(sequence, options, progress)
         sizes_m = lengths_m(options.sizes, job.objects)
@@ -120,9 +126,12 @@ def run(
 
 
 def recall(method: Point2Pose, memories: Mapping[str, ObjectMemory], frozen: bool) -> None:
-    """Have objects looked for that are known from memories."""
+    """Have objects looked for that are known from memories; warns of a camera by which one is seldom found."""
     for name, memory in memories.items():
         method.add_object(name, memory=memory, frozen=frozen)
+        if fewer := far_fewer_pixels(memory, method.camera):
+            fix = "All is metric and nothing is to be changed, but it is found near the learnt views alone."
+            doubt(f"memory of {name!r}", fewer, fix)
 
 
 def evaluate_tracker(
@@ -262,6 +271,20 @@ def _doubt_depth(job: _Job) -> None:
         doubt("depth", *found.doubt)
 
 
+def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> set[str]:
+    """Warn of objects that are where depth does not count; those whose mask and its depth tell, in range or not.
+
+    A run goes on without a pose then, as where a unit is another, and would say so at its end only.
+    """
+    limits, least_px = job.config.depth, job.config.lifecycle.min_mask_px
+    large = {name: mask for name, mask in masks.items() if mask is not None and np.count_nonzero(mask) >= least_px}
+    away_m = {name: m for name, mask in large.items() if np.isfinite(m := distance_m(frame, mask))}
+    out_m = {name: m for name, m in away_m.items() if in_range(frame.depth_m[large[name]], limits).mean() < _HARDLY}
+    if out_m and (wrong := beyond(out_m, limits, getattr(job.sequence, "depth_scale", 1.0))):
+        doubt(f"depth of {next(iter(out_m))!r} in frame {frame.index}", *wrong)
+    return set(away_m)
+
+
 def _frame_range(count: int, start: int, stop: int | None) -> range:
     """The frames from ``start`` to ``stop`` of a sequence of ``count``; :class:`BadInput` where there are none."""
     end = count if stop is None else min(stop, count)
@@ -337,7 +360,7 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
     # SAM 2 takes seconds for the first masks.
     bar = progress_bar(job.sequence.name, len(job.frames), shown=progress, first="First masks")
     with noted(keeper.doubts), bar:
-        left_out = writer.info["left_out"]
+        left_out, unseen = writer.info["left_out"], set(job.objects)
 
         def leave_out(index: int, unreadable: P2PError) -> None:
             left_out[str(index)] = str(unreadable)
@@ -349,6 +372,7 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
                 if (started := keeper.add(frame, estimates)) and progress:
                     bar.clear()
                     say(f"First masks of {', '.join(started)} in frame {frame.index}: {keeper.first_masks.path}")
+                unseen -= _doubt_range(job, frame, {n: mask for n, mask in method.masks.items() if n in unseen})
                 now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
                 bar.set_postfix_str(now, refresh=False)
                 bar.update()
@@ -376,7 +400,7 @@ def _estimates(
                 frame, masks = job.sequence.frame(i), (job.sequence.masks(i) or {}) if job.masks.every_mask else {}
             except P2PError as unreadable:
                 if leave_out is None or i in job.prompts:
-                    raise advised(unreadable, "A prompt needs this frame." if i in job.prompts else SKIP_BAD) from None
+                    raise advised(unreadable, _NEEDED if i in job.prompts else SKIP_BAD) from None
                 leave_out(i, unreadable)
                 continue
             for prompt in job.prompts.get(i, ()):
@@ -439,7 +463,7 @@ def _advice(run: Run, job: _Job) -> str:
         return ""
     why = " ".join(reasons.values())
     if set(reasons) <= set(job.memories):
-        fix = "show a side that was learnt, or click on it"
+        fix = "show a side that was learnt, or click on it, or it is not in this video"
     elif "depth" in why:
         fix = "its depth is missing, out of range or in another unit (--depth-scale)"
     elif "not seen yet" in why and not job.masks.every_mask:

@@ -14,6 +14,9 @@ from scipy.spatial.distance import mahalanobis
 
 from p2p_lib import open_sequence
 from p2p_lib.core import se3
+from p2p_lib.core.options import RunOptions
+from p2p_lib.extended.default import MECHANISMS, chosen
+from p2p_lib.extended.gates import DOUBTS, GATES
 
 PROJECT = Path(__file__).resolve().parents[1]
 
@@ -159,3 +162,11 @@ def test_a_mechanism_is_worth_what_the_method_loses_without_it(load):
     table = bench.compare(bench.pd.DataFrame([{"mechanism": m, "sequence": "s"} | run for m, run in zip(names, runs)]))
     assert table.loc["any pose", "ADD"] == pytest.approx(runs[0]["add"] - runs[1]["add"])
     assert table.loc["any pose", "lost"] == runs[1]["lost"]
+
+
+def test_what_runs_without_truth_are_asked_for_is_known(load):
+    bench = load("bench_verdicts")
+    for _, options, _, _ in (bench.TUNED | bench.KEPT_ASIDE).values():
+        chosen(RunOptions(**options).config())  # BadInput for a setting, a preset or a mechanism that is not known
+    without = chosen(RunOptions(**bench.NO_GATES).config())
+    assert without == MECHANISMS.keys() - GATES.keys() - DOUBTS.keys() and without

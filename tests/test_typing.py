@@ -19,6 +19,8 @@ tracker = p2p_lib.Point2Pose(p2p_lib.open_sequence("synthetic/crossing").camera)
 reveal_type(tracker)
 reveal_type(p2p_lib.warm_up())
 tracker.step("no frame")
+tracker.add_object("mug", klicks=[[320, 240]])
+tracker.correct("mug", click=[[320, 240]])
 """
 
 
@@ -56,15 +58,17 @@ def test_a_script_sees_the_types_of_an_editable_install(edited, tmp_path):
         'Revealed type is "float"' in said.replace("builtins.", "")
         and 'Argument 1 to "step" of "Point2Pose" has incompatible type "str"' in said
     )
-    assert "Found 1 error" in said
+    for keyword, method in (("klicks", "add_object"), ("click", "correct")):
+        assert f'Unexpected keyword argument "{keyword}" for "{method}"' in said
+    assert "Found 3 errors" in said
 
 
 def test_the_python_of_the_readme_is_sound_and_what_it_guards_against_is_reported(tmp_path):
     blocks = re.findall(r"```python\n(.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)
-    given, found = "import numpy as np\nvideo: list[tuple[np.ndarray, np.ndarray]] = []\n", {}
+    found = {}
     for name, guard in (("readme", "if model.surface is not None:"), ("unguarded", "if True:")):
         path = tmp_path / f"{name}.py"
-        path.write_text((given + "\n".join(blocks)).replace("if model.surface is not None:", guard))
+        path.write_text("\n".join(blocks).replace("if model.surface is not None:", guard))
         found[name] = checked(path, "--strict", "--follow-imports=silent", MYPYPATH=str(PROJECT))
     assert "Success" in found["readme"]
     assert 'Item "None" of "TsdfVolume | None" has no attribute "mesh"' in found["unguarded"]

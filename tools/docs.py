@@ -125,6 +125,7 @@ def json_lines(out):
 
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     said = re.search(r"### A camera\n(.*?)\n###? ", readme, re.DOTALL)[1]
+    said += re.search(r"\nAn estimate has a `T_cam_obj` only if.*?\n(?=\n)", readme, re.DOTALL)[0]  # "below"
     T_cam_obj = se3.exp(np.array([0, 0, 0, 0.1, 0.0, 0.6])).round(3)
     seen = PoseEstimate("mug", 31, 1.033, Status.TRACKED, T_cam_obj, 0.93, np.diag([4.0, 4, 9, 1, 1, 1]) * 1e-6)
     gone = PoseEstimate("mug", 32, 1.067, Status.OCCLUDED, reason="not found since frame 32")

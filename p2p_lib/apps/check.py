@@ -27,6 +27,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, evenly
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
+from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units
 from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
@@ -49,8 +50,6 @@ RATES_HZ, GAP = (0.5, 500.0), 10.0
 REPEATED_SHARE = 0.3
 #: Fraction of a mask's rim that may lie on the background: 0.4 at most on good sequences.
 RIM_SHARE = 0.5
-#: Fraction of a mask that should have a depth; half of it of the whole image.
-MEASURED_SHARE = 0.5
 #: What an object seldom is: so much of the image, so deep (of its distance). Good sequences: at most 0.07, 0.23.
 LARGE_SHARE, DEEP_SHARE = 0.12, 0.25
 #: Files of one fault that are named.
@@ -60,18 +59,6 @@ POSED = 3
 #: Fraction of depth at its largest value from which on it was cut off there.
 CLIPPED_SHARE = 0.1
 
-#: Metres per unit of depth images in the field, likeliest first, and whose they are.
-UNITS_M = {
-    0.001: "millimetres",
-    1.0: "metres",
-    1 / 5000: "TUM RGB-D",
-    1 / 4000: "1/4000 m, as of some LiDAR cameras",
-    0.0001: "tenths of millimetres, as of YCB-Video and short-range stereo",
-    1e-6: "micrometres",
-    0.01: "centimetres",
-}
-#: Where things stand that are tracked, m.
-_STANDS_M = (0.15, 5.0)
 _KNOWN = "--size NAME=CM (the object's longest side)"
 #: What to put where something of a folder is missing.
 _PUT = {
@@ -79,6 +66,7 @@ _PUT = {
     "depth": "Put the depth images there, registered to colour, one for each colour image, in 16-bit millimetres.",
     "K": WRITE_K,
 }
+_REPLACE = "Replace it, or leave out both of its images."
 
 
 def check_folder(
@@ -109,7 +97,11 @@ def check_folder(
     for i in evenly(whole, FRAMES).tolist():
         try:
             frames.append(sequence.frame(i))
-            masks.append({})
+        except P2PError as error:
+            wrong.append(_unreadable("files", error, otherwise=f"{_REPLACE} {images.SKIP_BAD}"))
+            continue
+        masks.append({})
+        try:
             masks[-1] = sequence.masks(i) or {}
         except P2PError as error:
             wrong.append(_unreadable("files", error))
@@ -150,12 +142,15 @@ def check_folder(
     return findings
 
 
-def _unreadable(name: str, error: P2PError, fix: str = "") -> Finding:
+def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "") -> Finding:
+    """An error as a finding; ``fix`` in place of its own advice, ``otherwise`` where it has none."""
     if isinstance(error, BadInput):
-        text = f"{error.name}: got {error.got}, expected {error.expected}"
-        return Finding(name, Level.WRONG, text, fix or error.fix)
-    text = f"{error.name}: {error.expected}" if isinstance(error, MissingData) and fix else str(error)
-    return Finding(name, Level.WRONG, text, fix)
+        text, advice = f"{error.name}: got {error.got}, expected {error.expected}", error.fix
+    elif isinstance(error, MissingData):
+        text, advice = f"{error.name}: {error.expected}", error.fix
+    else:
+        text, advice = str(error), ""
+    return Finding(name, Level.WRONG, text, fix or advice or otherwise)
 
 
 def _whole(sequence: Sequence) -> tuple[np.ndarray, list[Finding]]:
@@ -194,14 +189,16 @@ def _files(folder: Path) -> list[Finding]:
             return []
     wrong: list[Finding] = []
 
-    def look(name: str, fix: str, read: Callable[[], object]) -> None:
+    def look(name: str, fix: str, read: Callable[[], Any]) -> Any:
         try:
-            read()
+            return read()
         except P2PError as error:
             wrong.append(_unreadable(name, error, fix))
 
     def first(part: str, suffixes: tuple[str, ...], read: Callable[[Path], np.ndarray]) -> None:
-        look(f"{part}/", _PUT[part], lambda: read(images.list_files(folder / part, suffixes, f"{part} images")[0]))
+        files = look(f"{part}/", _PUT[part], lambda: images.list_files(folder / part, suffixes, f"{part} images"))
+        if files:
+            look(f"{part}/", _REPLACE, lambda: read(files[0]))
 
     first("rgb", images.COLOUR, images.read_rgb)
     first("depth", images.DEPTH, images.read_raw_depth)
@@ -313,20 +310,12 @@ def _depth(frames: list[Frame], scale: float) -> Finding:
             fix = "Export the depth again, as 16-bit millimetres: no scale restores what was cut off."
             return Finding("depth", Level.WRONG, text, fix)
         fix = "Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1)."
-        fix += f" {guess}." if (guess := _units(median_m, scale)) else ""
+        fix += f" {guess}." if (guess := likely_units(median_m, scale)) else ""
         return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
     if share < MEASURED_SHARE / 2:
         fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
         return Finding("depth", Level.LOOK, text, fix)
     return Finding("depth", Level.OK, text)
-
-
-def _units(median_m: float, scale: float) -> str:
-    """The units of the field that bring a depth to where things stand before a camera, likeliest first, in words."""
-    fits = [(unit, what, median_m * unit / scale) for unit, what in UNITS_M.items() if not np.isclose(unit, scale)]
-    fits = [(unit, what, m) for unit, what, m in fits if _STANDS_M[0] <= m <= _STANDS_M[1]][:3]
-    units = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
-    return f"A unit of {', of '.join(units)}" if units else ""
 
 
 def _registered(frames: list[Frame]) -> Finding:
@@ -357,29 +346,14 @@ def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) ->
     return Finding(f"{name}: mask", Level.WRONG, text, "Click again, near the centre of the object: p2p click.")
 
 
-def _distance_m(frame: Frame, mask: np.ndarray) -> float:
-    """Median depth of what is measured of a mask; NaN where nothing is, or too little of it."""
-    depth_m = frame.depth_m[mask]
-    measured = depth_m[depth_m > 0]
-    enough = len(measured) and len(measured) >= MEASURED_SHARE * len(depth_m)
-    return float(np.median(measured)) if enough else float("nan")
-
-
 def _beyond(firsts: FirstMasks, config: Config, scale: float) -> Finding | None:
-    """The one finding of objects that are all too far away, or all too near: most likely depth is in another unit."""
-    limits, away_m = config.depth, {name: _distance_m(*first) for name, first in firsts.items()}
-    distances = np.array(list(away_m.values()))
-    far = bool((distances > limits.max_m).all())
-    if not far and not (distances < limits.min_m).all():
+    """The one finding of objects that are all out of range."""
+    wrong = beyond({name: distance_m(*first) for name, first in firsts.items()}, config.depth, scale)
+    if wrong is None:
         return None
-    (first, (frame, mask)), *others = firsts.items()
-    text = f"{away_m[first]:.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    text += f" ({', '.join(f'{name} {away_m[name]:.2f} m' for name, _ in others)})" if others else ""
-    guess = f". {units}" if (units := _units(float(distances[0]), scale)) else ""
-    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
-    fix = f"If it was, --set depth.{wider}; if it was not, the depth scale is wrong (--depth-scale){guess}."
-    text += f", but {limits.min_m:g} to {limits.max_m:g} m count"
-    return Finding(f"{first}: depth", Level.WRONG, text, fix)
+    (first, (frame, mask)), *_ = firsts.items()
+    text = f"{wrong[0]}; {int(mask.sum())} pixels in frame {frame.index}"
+    return Finding(f"{first}: depth", Level.WRONG, text, wrong[1])
 
 
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: float) -> Finding:
@@ -389,7 +363,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: flo
         fix = "Dark, shiny and transparent things have none; change the light or the distance, or spray it matt."
         text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
-    text = f"{_distance_m(frame, mask):.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
+    text = f"{distance_m(frame, mask):.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
     return _beyond({name: (frame, mask)}, config, scale) or Finding(f"{name}: depth", Level.OK, text)
 
 

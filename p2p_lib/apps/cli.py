@@ -107,7 +107,7 @@ def _run(a: argparse.Namespace) -> int:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
 
-        table = run_batch(a.batch, a.out, options, a.jobs, a.scheduler, not a.quiet)
+        table = run_batch(a.batch, a.out, options, a.jobs, a.scheduler, not a.quiet, warn)
         print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
         if failed := int(table["object"].isna().sum()):
             warn(
@@ -427,6 +427,7 @@ def _figures(a: argparse.Namespace) -> None:
     "refine",
     "go over a finished run with the whole video; its better poses and surfaces go to DIR/offline",
     _RUN,
+    arg("--force", action="store_true", help="also where DIR/offline is of the same poses and code already"),
     QUIET,
 )
 def _refine(a: argparse.Namespace) -> None:
@@ -434,7 +435,7 @@ def _refine(a: argparse.Namespace) -> None:
     from p2p_lib.offline.refine import refine_run
 
     try:
-        print("\n".join(refine_run(a.run, not a.quiet)))
+        print("\n".join(refine_run(a.run, not a.quiet, a.force)))
     except KeyboardInterrupt:
         then = f"Go on: p2p refine {quote(str(a.run))}; it keeps the objects that are finished."
         raise KeyboardInterrupt(then) from None

@@ -12,7 +12,6 @@ import threading
 import traceback
 import warnings
 import webbrowser
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -24,7 +23,7 @@ from tqdm import tqdm
 
 from p2p_lib import __version__
 from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
-from p2p_lib.core.errors import Doubt, P2PError, did_you_mean, in_a_line
+from p2p_lib.core.errors import Doubt, Doubts, P2PError, did_you_mean, in_a_line
 from p2p_lib.core.options import RunOptions, add_options
 from p2p_lib.core.plugins import is_place, offered
 
@@ -82,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.log:
         logging.basicConfig(format="%(name)s %(levelname)s %(message)s")
         logging.getLogger("p2p_lib").setLevel(arguments.log.upper())
-    ended_by, doubts = [signal.SIGINT], Counter[str]()
+    ended_by, doubts = [signal.SIGINT], Doubts()
 
     def terminated(number: int, frame: object) -> None:
         ended_by.append(signal.Signals(number))
@@ -110,9 +109,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         warn(f"p2p {arguments.name}: interrupted{f'. {interrupt}' if str(interrupt) else ''}")
         return EXIT_INTERRUPTED + ended_by[-1]
     finally:
-        for doubt, count in doubts.items():
-            if count > 1:
-                warn(f"p2p {arguments.name}: {count - 1} more like: {doubt}")
+        for line in doubts.more:
+            warn(f"p2p {arguments.name}: {line}")
         if in_main:
             signal.signal(signal.SIGTERM, before)
 
@@ -210,12 +208,10 @@ def open_page(url: str) -> bool:
     return bool({"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)) and webbrowser.open(url)
 
 
-def _show_doubt(others: Callable, name: str, doubts: Counter[str], message: Any, category: type, *where: Any) -> None:
+def _show_doubt(others: Callable, name: str, doubts: Doubts, message: Any, category: type, *where: Any) -> None:
     """A doubt is said once, however often it comes with other numbers; how often is said at the end."""
     if not issubclass(category, Doubt):
         others(message, category, *where)
         return
-    alike = re.sub(r"\d+", "N", str(message))
-    doubts[alike] += 1
-    if doubts[alike] == 1:
+    if doubts.add(str(message)):
         warn(f"p2p {name}: {message}")

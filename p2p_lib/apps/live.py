@@ -20,7 +20,7 @@ import numpy as np
 
 from p2p_lib.apps.click import Clicker, wait_for_clicks
 from p2p_lib.apps.live_click import LiveClicker
-from p2p_lib.apps.live_words import Words
+from p2p_lib.apps.live_words import FORM, Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput
@@ -92,7 +92,7 @@ def track_live(
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
     overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
     backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
-    say      told what it waits for before the first image
+    say      told what it waits for before the first image, and then where ``words`` come from
     words    says of objects what comes in meanwhile; there need be no prompts then
     page     shows every frame that was tracked
 
@@ -137,6 +137,8 @@ def track_live(
         stop = math.inf if options.stop is None else options.stop
         newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog, stop))
         frame = first or newest.take()
+        if frame is not None and words is not None and words.reads:
+            say(f"{camera.name} runs; objects are told on standard input, a line each: {FORM}")
         while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))

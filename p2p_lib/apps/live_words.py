@@ -16,7 +16,8 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets.prompts import KEYS, parse_prompts
 from p2p_lib.extended.default import Point2Pose
 
-_FORM = '{"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}'
+#: What a line says.
+FORM = '{"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}'
 #: A reader that takes no line for so long is no longer there, s.
 _GONE_S = 0.5
 
@@ -32,6 +33,7 @@ class Words:
     def __init__(self, lines: Iterable[str] | None, say: Callable[[str], object]):
         self._pending: deque[tuple[str, Prompt | None]] = deque()
         self._say = say
+        self.reads = lines is not None  # by itself
         if lines is not None:
             threading.Thread(target=lambda: deque(map(self.hear, lines), 0), daemon=True).start()
 
@@ -64,7 +66,7 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
     try:
         message = json.loads(line)
     except ValueError as error:
-        raise BadInput("line", f"{line.strip()[:60]} ({in_a_line(error)})", _FORM) from None
+        raise BadInput("line", f"{line.strip()[:60]} ({in_a_line(error)})", FORM) from None
     if isinstance(message, dict) and message.keys() == {"remove"} and isinstance(message["remove"], str):
         return [(message["remove"], None)]
     if isinstance(message, dict) and "objects" in message:
@@ -72,7 +74,7 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
     elif isinstance(message, dict) and {"name"} < message.keys() <= KEYS:
         prompts = parse_prompts({"objects": [message]})
     else:
-        raise BadInput("line", line.strip()[:60], _FORM)
+        raise BadInput("line", line.strip()[:60], FORM)
     return [(prompt.name, prompt) for prompt in prompts]
 
 

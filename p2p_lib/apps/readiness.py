@@ -12,7 +12,7 @@ from p2p_lib.benchmark.plan import plan_names, read_plan
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.sequence import SYNTHETIC
 
-_TITLE = 60  # letters of a plan's title that a narrow table has room for
+_TITLE = 62  # letters on a plan that a narrow table has room for
 
 
 def readiness(name: str) -> str:
@@ -26,8 +26,12 @@ def readiness(name: str) -> str:
     for method, reasons in found.items():
         ready = sum(not reason for reason in reasons.values())
         count = f"{ready} of {len(reasons)} sequences"
-        if why := list(dict.fromkeys(reason for reason in reasons.values() if reason)):
-            count += f"; else: {why[0]}" + f" ({len(why) - 1} more likewise)" * (len(why) > 1)
+        why: dict[str, list[str]] = defaultdict(list)  # by what they say but for the sequence's name
+        for sequence, reason in reasons.items():
+            if reason:
+                why[reason.replace(sequence, "")].append(reason)
+        told = [f"{of[0]}" + f" ({len(of) - 1} more likewise)" * (len(of) > 1) for of in why.values()]
+        count += "; else: " * bool(told) + "; ".join(told)
         alike[count].append(method)
     return "\n".join([*lines, *(f"  {'; '.join(methods)}: {count}" for count, methods in alike.items())])
 
@@ -42,7 +46,11 @@ def overview() -> Iterator[str]:
         jobs = {(job.method.name, job.sequence.name): job.reason for job in jobs_of(plan, "full")}
         ready = sum(not reason for reason in jobs.values())
         whole, here, every = whole + (ready == len(jobs)), here + ready, every + len(jobs)
-        yield f"{name:{width}}  {f'{ready} of {len(jobs)}':11}  {shorten(plan.title, _TITLE, placeholder=' ...')}"
+        what = plan.title + ", the paper's" * bool(plan.paper)
+        if not ready and (bundled := f"{name}_embedded") in names:
+            what += f"; here: {bundled}"
+        what = shorten(what, _TITLE, placeholder=" ...")
+        yield f"{name:{width}}  {f'{ready} of {len(jobs)}':11}  {what}"
     yield f"{whole} of {len(names)} plans can run here and now in full; {here} of {every} methods on a sequence can."
 
 

@@ -7,6 +7,7 @@ not run again; what was cut short goes on.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from p2p_lib.benchmark.execution import execute
 from p2p_lib.benchmark.outcome import Outcome
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.core.files import replacing
+from p2p_lib.core.memory import load_memories
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.datasets.runs import load_run
@@ -44,7 +46,7 @@ def recordings(folder: str | Path, options: RunOptions) -> list[Recording]:
     if not folder.is_dir():
         raise BadInput(str(folder), "no folder", "a folder of recordings, each a folder of its own")
     found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
+    for path in _folders(folder):
         try:
             recognise(path)
         except BadInput:
@@ -57,6 +59,10 @@ def recordings(folder: str | Path, options: RunOptions) -> list[Recording]:
     return found
 
 
+def _folders(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
 def run_batch(
     folder: str | Path,
     out: str | Path,
@@ -64,26 +70,34 @@ def run_batch(
     jobs: int | None = None,
     scheduler: str | None = None,
     progress: bool = False,
+    say: Callable[[str], object] = lambda line: None,
 ) -> DataFrame:
     """Run every recording in a folder; the table that ``OUT/batch.csv`` keeps, a row per recording and object.
 
     jobs       so many at a time (default: one a core); scheduler, instead, the address of a Dask cluster
 
-    A recording that cannot be run has a row that says why; the others are run.
+    A recording that cannot be run has a row that says why; the others are run. ``say`` is told of folders that hold
+    none.
     """
     from pandas import DataFrame
 
     options, out = options or RunOptions(), Path(out)
     options.config()  # what does not fit is said once
+    load_memories(options.memory or ())
     todo = recordings(folder, options)
     if out.resolve().is_relative_to(Path(folder).resolve()):
         raise BadInput(str(out), "a folder among the recordings", "another one for the results")
+    if passed_over := sorted({path.name for path in _folders(Path(folder))} - {one.key for one in todo}):
+        say(f"No recording, and passed over: {', '.join(passed_over)}")
     out.mkdir(parents=True, exist_ok=True)
     done: dict[str, Outcome] = {}
     with progress_bar("batch", len(todo), "recording", progress) as bar:
         for job, outcome in execute(todo, out, jobs or os.cpu_count() or 1, scheduler, tracked):
             done[job.key] = outcome
             bar.update()
+    for path in (out / "failures").glob("*.txt"):  # of earlier calls, too
+        if path.stem not in done or done[path.stem].status != "failed":
+            path.unlink()
     table = DataFrame([row for one in todo for row in _rows(one, out / one.key, done[one.key])])
     with replacing(out / TABLE) as file:
         file.write(table.astype({"frames": "Int64"}).to_csv(index=False).encode())  # whole, though some have none

@@ -27,6 +27,7 @@ from p2p_lib.benchmark.jobs import Job, library_version, open_planned
 from p2p_lib.benchmark.outcome import Outcome, run_path
 from p2p_lib.benchmark.scoring import chamfer, fault_done, scored
 from p2p_lib.core import packages
+from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput, Doubt, MissingBackend, MissingData, P2PError
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets.runs import Run, load_run
@@ -76,6 +77,7 @@ def measured(job: Job, out: Path) -> Outcome:
 def _poses(job: Job, out: Path) -> Outcome:
     sequence = open_planned(job)
     unfinished = run_path(out, f".{job.key}.{platform.node()}.{os.getpid()}")
+    warm_up()  # compiling is no frame's time
     started_s = time.process_time()
     try:
         result = run(sequence, unfinished, job.options(sequence.objects), progress=False)

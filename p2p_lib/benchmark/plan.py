@@ -53,7 +53,7 @@ class Method(Strict):
     masks: Text = "dataset"
     settings: dict[str, Any] = {}
     synthetic: dict[str, Any] = {}
-    scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    scale: Annotated[float, Field(gt=0, le=4)] = 1.0
     count: Count = 0
     only: list[Text] = []
     but: list[Text] = []

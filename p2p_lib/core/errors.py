@@ -5,9 +5,11 @@ The command line prints the message on one line and leaves with ``exit_code``.
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 
 
@@ -71,6 +73,32 @@ def doubt(name: str, got: object, fix: str) -> None:
     while at.f_back is not None and at.f_globals.get("__name__", "").startswith(("p2p_lib.", "contextlib")):
         level, at = level + 1, at.f_back
     warnings.warn(Doubt(_sentence(f"{name}: {got}", fix)), stacklevel=level)
+
+
+class Doubts:
+    """Doubts as they come: those that differ in numbers alone are one, with its count. Names in quotes differ."""
+
+    def __init__(self) -> None:
+        self._count: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
+
+    def add(self, text: str) -> bool:
+        """Whether it is the first of its kind."""
+        alike = re.sub(r"('[^']*')|\d+", lambda found: found[1] or "N", text)
+        self._first.setdefault(alike, text)
+        self._count[alike] += 1
+        return self._count[alike] == 1
+
+    @property
+    def more(self) -> list[str]:
+        """A line for each of which more came than the first."""
+        return [f"{count - 1} more like: {alike}" for alike, count in self._count.items() if count > 1]
+
+    def __iter__(self) -> Iterator[str]:
+        """The first of each kind; of those that came again it says how often."""
+        for alike, text in self._first.items():
+            more = self._count[alike] - 1
+            yield f"{text} ({more} more like it)" if more else text
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:

@@ -1,19 +1,21 @@
 """What is known of an object, to take away: a plain value, and one file of it (not in the paper).
 
-A memory is of the object alone. It is metric, so that another camera, another place and another day change nothing.
+A memory is of the object alone. It is metric, so that another camera, another place and another day change nothing of
+its poses; only a camera that shows it in far fewer pixels finds it less often (:func:`far_fewer_pixels`).
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import check_arrays, file_name, load_arrays, of_shape, parse_json, read_text, save_arrays
 
@@ -30,6 +32,8 @@ _POSE_TOLERANCE = 5e-3
 _FARTHEST_M, _BESIDE = 100.0, 10
 #: Above the weight that is written.
 _MOST_WEIGHT = 1e6
+#: A camera with less than this share of the focal length, px, shows an object in far fewer pixels.
+_FEWER = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +104,8 @@ class ObjectMemory:
     covariance   (6, 6) of the newest keyframe, right tangent of T_cam_obj
     seen_m2      the most that a keyframe showed of it, across the line of sight
     surface      with colours
-    made_of      where it comes from: plain values, and as ``before`` a list of the same of the memories that it began
-                 with, the oldest first, whose object frame it is in
+    made_of      where it comes from: plain values, among them the ``camera`` (:func:`camera_words`), and as ``before``
+                 a list of the same of the memories that it began with, the oldest first, whose object frame it is in
 
     There is one covariance, not one a keyframe: that of the map, to which the covariance of a frame is added, is its
     newest keyframe's. How well the older ones were known is in the landmarks, each with the ``confidence`` of the pose
@@ -165,6 +169,24 @@ def _check_origins(what: str, made_of: Mapping[str, Any]) -> None:
         raise BadInput(f"{what}: made_of", repr(made_of)[:120], "values by name, and before, a list of such")
 
 
+def camera_words(camera: Camera) -> dict[str, float]:
+    """What a memory says of the camera that it was learnt with."""
+    return {"fx": camera.fx, "width": camera.width, "height": camera.height}
+
+
+def far_fewer_pixels(memory: ObjectMemory, camera: Camera) -> str:
+    """What there is to say of a camera that shows an object in far fewer pixels than the one it was learnt with did.
+
+    Nothing of any other, and of a memory that does not say with which camera it was learnt.
+    """
+    origins = [memory.made_of, *memory.made_of.get("before", [])]
+    cameras = [of["camera"] for of in origins if isinstance(of.get("camera"), Mapping)]
+    focal_px = [fx for of in cameras if isinstance(fx := of.get("fx"), int | float)]
+    if not focal_px or camera.fx >= _FEWER * min(focal_px):
+        return ""
+    return f"learnt with a focal length of {min(focal_px):.0f} px, looked for with {camera.fx:.0f} px"
+
+
 def save_memory(path: str | Path, memory: ObjectMemory) -> None:
     """Write a memory as one ``.npz`` file of arrays and JSON, whole or not at all."""
     save_memories(path, {memory.name: memory}, _KIND, {})
@@ -226,16 +248,31 @@ def _memory(name: str, made_of: Mapping[str, Any], arrays: Mapping[str, np.ndarr
 def load_memories(paths: Sequence[str | Path]) -> dict[str, ObjectMemory]:
     """Object to its memory, of files and of all those in a run's folder or in its ``maps/``.
 
-    Raises as :func:`load_memory`, and :class:`BadInput` for two of one name.
+    ``NAME=PATH``, of what is no path itself, is the one memory there under another name. Raises as
+    :func:`load_memory`, and :class:`BadInput` for two of one name.
     """
-    found: dict[str, ObjectMemory] = {}
-    for path in (file for given in paths for file in _files(Path(given))):
+    found: dict[str, tuple[Path, ObjectMemory]] = {}
+    for path, name in (of for given in paths for of in _named(given)):
         memory = load_memory(path)
+        memory = memory if name is None else replace(memory, name=name)
         if memory.name in found:
-            fix = "Give one of them; in Python, add_object takes the other under another name."
-            raise BadInput("memory", f"two of {memory.name!r}", "one an object", fix)
-        found[memory.name] = memory
-    return found
+            got = f"two of {memory.name!r}: {found[memory.name][0]} and {path}"
+            fix = f"Give one of them, or one under another name: --memory NAME={path}."
+            raise BadInput("memory", got, "one an object", fix)
+        found[memory.name] = path, memory
+    return {name: memory for name, (_, memory) in found.items()}
+
+
+def _named(given: str | Path) -> list[tuple[Path, str | None]]:
+    """The files that are given as a path or as ``NAME=PATH``, each with its name if it is to have another one."""
+    name, equals, path = str(given).partition("=")
+    if not equals or Path(given).exists():
+        return [(file, None) for file in _files(Path(given))]
+    if not path:
+        raise BadInput("memory", repr(given), "NAME=PATH, or a path")
+    if len(files := _files(Path(path))) > 1:
+        raise BadInput("memory", f"{given}, a folder of {len(files)}", "one for one name", f"Give one: {files[0]}.")
+    return [(files[0], file_name("memory name", name))]
 
 
 def _files(path: Path) -> list[Path]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import RLock
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, NoReturn, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -88,6 +88,10 @@ class Objects(ABC, Generic[FollowedT]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def __reduce_ex__(self, protocol: object) -> NoReturn:
+        fix = "save(path) keeps what it knows, and Point2Pose.load(path) goes on with it"
+        raise TypeError(f"a tracker cannot be copied or pickled: {fix}")
+
     @abstractmethod
     def end(self) -> None:
         """End what runs beside the calls; nothing is called afterwards."""
@@ -132,13 +136,21 @@ class Objects(ABC, Generic[FollowedT]):
             with self.alone():
                 self.begin(name)
         else:
-            self.tell(_prompt(name, mask=mask, clicks=clicks, negative=negative, box=box))
+            self.tell(_prompt(name, mask, clicks, negative, box))
 
-    def correct(self, name: str, **arguments: ArrayLike | None) -> None:
+    def correct(
+        self,
+        name: str,
+        *,
+        mask: np.ndarray | None = None,
+        clicks: ArrayLike | None = None,
+        negative: ArrayLike | None = None,
+        box: ArrayLike | None = None,
+    ) -> None:
         """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
         if name not in self.objects:
             raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
-        self.tell(_prompt(name, **arguments))
+        self.tell(_prompt(name, mask, clicks, negative, box))
 
     def tell(self, prompt: Prompt) -> None:
         """A prompt for the next frame, whichever that is: it starts its object, or corrects its mask."""
@@ -243,10 +255,13 @@ class Objects(ABC, Generic[FollowedT]):
         return f"{known}{NOT_FOUND} since frame {self._without[name]}"
 
 
-def _prompt(name: str, **arguments: ArrayLike | None) -> Prompt:
-    """The prompt of the arguments of :meth:`Point2Pose.add_object`; TypeError for any other."""
-    field = {"mask": "mask", "clicks": "points_px", "negative": "negative_px", "box": "box_px"}
-    if unknown := sorted(set(arguments) - set(field)):
-        raise TypeError(f"unknown argument {unknown[0]!r}, expected some of {', '.join(field)}")
-    values: dict[str, Any] = {field[key]: value for key, value in arguments.items() if value is not None}
-    return Prompt(name, **values)
+def _prompt(
+    name: str,
+    mask: np.ndarray | None,
+    clicks: ArrayLike | None,
+    negative: ArrayLike | None,
+    box: ArrayLike | None,
+) -> Prompt:
+    """The prompt of the arguments of :meth:`Objects.add_object`."""
+    fields: dict[str, Any] = {"mask": mask, "points_px": clicks, "negative_px": negative, "box_px": box}
+    return Prompt(name, **{key: value for key, value in fields.items() if value is not None})

@@ -72,10 +72,10 @@ _MASKS = _typed(
 )
 _PROMPTS = _typed("what starts objects and corrects masks (see p2p click)", type=Path, metavar="FILE")
 _MEMORY = _typed(
-    "look for an object that an earlier run learnt (its maps/OBJECT.npz; a run's folder: all of them); "
-    "repeatable, no clicks needed",
+    "look for an object that an earlier run learnt (its maps/OBJECT.npz; a run's folder: all of them), as NAME=PATH "
+    "under another name; repeatable, no clicks needed",
     action="append",
-    metavar="PATH",
+    metavar="[NAME=]PATH",
 )
 _FROZEN = _typed("keep the maps of --memory as they are: nothing is added", action="store_true")
 _SAVE_MASKS = _typed("keep the masks used as DIR/masks/OBJECT/*.png", action="store_true")

@@ -105,7 +105,7 @@ class Predictor:
 
     def predict(self, name: str, time_s: float) -> Prediction | None:
         """The pose at a time, at or after that of the newest sure pose; None where there never was one."""
-        if not isinstance(time_s, Real):
+        if isinstance(time_s, bool) or not isinstance(time_s, Real):
             raise BadInput("predict time_s", repr(time_s), "a time in seconds")
         known = self._moving.get(name)
         if known is None or (known.in_world and self._T_world_cam is None):

@@ -18,13 +18,13 @@ def ray_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 
 def cast(scene: Any, eye: np.ndarray, rays: np.ndarray) -> dict[str, np.ndarray]:
-    """Where rays (N, 3) of any length from one eye (3,) meet a scene first.
+    """Where rays (N, 3) of any length, from one eye (3,) or an eye each (N, 3), meet a scene first.
 
     ``t_hit`` (N,) is in lengths of the ray, infinite where it meets nothing; ``primitive_ids`` (N,) says which face, -1
     where none; ``primitive_normals`` (N, 3) is its unit normal by the order of its corners, 0 where none.
     """
     rays = np.asarray(rays, np.float32)
-    eyes = np.tile(np.asarray(eye, np.float32), (len(rays), 1))
+    eyes = np.array(np.broadcast_to(np.asarray(eye, np.float32), rays.shape))
     found = scene.run(eyes, rays, query="INTERSECT", output=True)
     met = found["primID"] >= 0
     normals = np.where(met[:, None], found["Ng"], np.float32(0))

@@ -25,6 +25,7 @@ SPARSE = np.s_[::8, ::8]
 class Frame:
     """One RGB-D image.
 
+    index    counts the images of its sequence or camera, from 0
     rgb      (H, W, 3) uint8, red first
     depth_m  (H, W) float32, metres along the optical axis, registered to rgb; 0 = no measurement, which NaN
              and any reading outside :data:`NEAREST_M` to :data:`FARTHEST_M` become
@@ -49,6 +50,9 @@ class Frame:
 
     def __post_init__(self) -> None:
         rgb, depth = self.rgb, self.depth_m
+        if isinstance(self.index, bool) or not isinstance(self.index, int | np.integer) or self.index < 0:
+            raise BadInput("frame index", repr(self.index), "a whole number from 0")
+        object.__setattr__(self, "index", int(self.index))  # NumPy's is no number to JSON
         for what, image in (("colour", rgb), ("depth", depth)):
             if not isinstance(image, np.ndarray):
                 raise BadInput(f"frame {self.index} {what}", type(image).__name__, "a NumPy array")

@@ -52,7 +52,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The scene in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     rgb, depth = paired_images(folder)
     numbers = [_number(path) for path in rgb]
-    camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb[0])
+    camera, scale_mm = _camera(folder / "scene_camera.json", numbers, rgb)
     files = ImageSequence(folder, rgb, depth, camera, (np.array(numbers) - numbers[0]) / images.DEFAULT_HZ)
     listed = _named(_lists(folder / "scene_gt.json", dict[int, list[_Pose]]), numbers)
     objects = tuple(sorted({obj for at in listed for obj in at}))
@@ -73,7 +73,7 @@ def _number(path: Path) -> int:
     return int(path.stem)
 
 
-def _camera(path: Path, numbers: list[int], image: Path) -> tuple[Camera, float]:
+def _camera(path: Path, numbers: list[int], rgb: tuple[Path, ...]) -> tuple[Camera, float]:
     """The one camera of a scene, and its depth scale in millimetres per unit."""
     scene = read_json(path, dict[int, _Camera], "cam_K and depth_scale for every image")
     if gone := set(numbers) - scene.keys():
@@ -83,7 +83,7 @@ def _camera(path: Path, numbers: list[int], image: Path) -> tuple[Camera, float]
         fix = "T-LESS, whose images are crops, cannot be tracked."
         raise BadInput(str(path), f"{len(found)} cameras", "one camera and depth scale for the whole scene", fix)
     K, scale_mm = found.pop()
-    return camera_for(image, np.reshape(K, (3, 3)), str(path)), scale_mm
+    return camera_for(rgb, np.reshape(K, (3, 3)), str(path)), scale_mm
 
 
 def _lists(path: Path, of: Any) -> dict[int, list]:

@@ -115,7 +115,7 @@ class OwnCamera:
     """
 
     def __init__(self, spec: str, own: LiveCamera):
-        self._spec, self._own, self._closed = spec, own, False
+        self._spec, self._own, self._closed, self._last = spec, own, False, -1
         name, camera = getattr(own, "name", None), getattr(own, "camera", None)
         if not isinstance(name, str):
             raise BadInput(f"camera {spec}: name", repr(name), "a text")
@@ -124,10 +124,15 @@ class OwnCamera:
         self.name, self.camera = name, camera
 
     def read(self) -> Frame | None:
-        """Its next frame; :class:`BadInput` for anything else."""
+        """Its next frame; :class:`BadInput` for anything else, and for an index that is not above the last one."""
         frame = self._own.read()
         if frame is not None and not isinstance(frame, Frame):
             raise BadInput(f"camera {self._spec}: read()", type(frame).__name__, "a p2p_lib.Frame, or None at the end")
+        if frame is not None and frame.index <= self._last:
+            got = f"index {frame.index} after {self._last}"
+            fix = "Count the camera's own images from 0: those that were dropped leave gaps."
+            raise BadInput(f"camera {self._spec}: read()", got, "an index that increases", fix)
+        self._last = self._last if frame is None else frame.index
         return frame
 
     def close(self) -> None:

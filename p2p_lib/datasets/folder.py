@@ -31,7 +31,7 @@ _FARTHEST_M = 20.0
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     files = image_files(folder)
-    scale = _depth_scale(folder / "depth_scale.txt", files.depth[0])
+    scale = _depth_scale(folder / "depth_scale.txt", files.depth)
     return replace(files, depth_scale=scale).without_truth(masks)
 
 
@@ -85,11 +85,11 @@ def write_about(out: str | Path, camera: Camera, times_s: Iterable[float], unit_
         np.savetxt(Path(out) / "depth_scale.txt", [unit_m], fmt="%.9g")
 
 
-def _depth_scale(path: Path, first: Path) -> float:
+def _depth_scale(path: Path, depth: tuple[Path, ...]) -> float:
     """Metres per unit, as the file says; where there is none millimetres, or what the floats of the first image are."""
     if not path.is_file():
-        floats = first.suffix.lower() in (".npy", ".tif", ".tiff")
-        raw = images.read_raw_depth(first) if floats else np.zeros(0, np.uint16)
+        floats = depth[0].suffix.lower() in (".npy", ".tif", ".tiff")
+        raw = images.first_readable(depth, images.read_raw_depth) if floats else np.zeros(0, np.uint16)
         known = raw[raw > 0]
         in_metres = raw.dtype.kind == "f" and len(known) and np.median(known) < _FARTHEST_M
         return 1.0 if in_metres else images.DEPTH_SCALE

@@ -36,7 +36,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     rgb, depth = paired_images(folder)
     meta_files = images.check_paired(images.list_files(folder / "meta", (".pkl",), "meta files"), rgb)
     first = read_meta(meta_files[0])
-    camera = camera_for(rgb[0], first["camMat"], f"{meta_files[0]}: camMat")
+    camera = camera_for(rgb, first["camMat"], f"{meta_files[0]}: camMat")
     files = ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
     at = images.full(folder)
     folders = [at.parents[1] / str(where) / at.name for where in ([masks] if masks else MASKS)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,9 +26,9 @@ def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], 
     return rgb, images.paired_depth(images.list_files(folder / "depth", images.DEPTH, "depth images"), rgb)
 
 
-def camera_for(rgb: Path, K: np.ndarray, name: str) -> Camera:
-    """The camera with this matrix for images as large as the one in the file; ``name`` is for messages."""
-    height, width = images.read_rgb(rgb).shape[:2]
+def camera_for(rgb: Sequence[Path], K: np.ndarray, name: str) -> Camera:
+    """The camera with this matrix for images as large as the first of the files; ``name`` is for messages."""
+    height, width = images.first_readable(rgb, images.read_rgb).shape[:2]
     return Camera.from_K(K, width, height, name=name)
 
 
@@ -140,7 +140,7 @@ class ImageSequence:
 def image_files(folder: Path) -> ImageSequence:
     """The sequence in a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
     rgb, depth = paired_images(folder)
-    camera = camera_for(rgb[0], read_K(folder), str(folder / "cam_K.txt"))
+    camera = camera_for(rgb, read_K(folder), str(folder / "cam_K.txt"))
     return ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from io import BytesIO
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised
 from p2p_lib.core.files import LARGEST_IMAGE_PX, UNREADABLE, read_array, read_bytes, read_text, replacing
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -49,6 +49,17 @@ def paired_depth(files: tuple[Path, ...], rgb: tuple[Path, ...]) -> tuple[Path, 
     if _gaps.get() and len(files) < len(rgb) and by_name.keys() <= {path.stem for path in rgb}:
         return tuple(by_name.get(path.stem, files[0].with_stem(path.stem)) for path in rgb)
     return check_paired(files, rgb, SKIP_BAD if len(files) < len(rgb) else "")
+
+
+def first_readable(files: Sequence[Path], read: Callable[[Path], np.ndarray]) -> np.ndarray:
+    """The first image, by which the others are read; where :func:`gaps_allowed` says so, the first that can be read."""
+    for path in files:
+        try:
+            return read(path)
+        except P2PError as error:
+            if not _gaps.get():
+                raise advised(error, SKIP_BAD) from None
+    raise BadInput(str(files[0].parent), f"{len(files)} files that cannot be read", "one image that can at least")
 
 
 def full(folder: Path) -> Path:

@@ -33,5 +33,5 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", "Open3D's recorder writes it beside color/.")
     # It is written column by column.
     K = np.array(read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it").intrinsic_matrix).reshape(3, 3).T
-    files = ImageSequence(folder, rgb, depth, camera_for(rgb[0], K, str(path)), images.frame_times(folder, rgb))
+    files = ImageSequence(folder, rgb, depth, camera_for(rgb, K, str(path)), images.frame_times(folder, rgb))
     return files.without_truth(masks)

@@ -39,7 +39,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         folder,
         tuple(rgb[i] for i in pairs),
         tuple(depth[i] for i in nearest[pairs]),
-        camera_for(rgb[0], *_K(folder)),
+        camera_for(rgb, *_K(folder)),
         rgb_s[pairs],
         depth_scale=DEPTH_SCALE,
     )

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from p2p_lib.core import backends
 from p2p_lib.core.camera import Camera
@@ -121,7 +122,15 @@ class Point2Pose(Savable):
             self._turn = turn
 
     def add_object(
-        self, name: str, *prompt: Any, memory: ObjectMemory | None = None, frozen: bool = False, **more: Any
+        self,
+        name: str,
+        mask: np.ndarray | None = None,
+        clicks: ArrayLike | None = None,
+        negative: ArrayLike | None = None,
+        box: ArrayLike | None = None,
+        *,
+        memory: ObjectMemory | None = None,
+        frozen: bool = False,
     ) -> None:
         """As in :class:`p2p_lib.core.objects.Objects`, or an object that is known from a memory.
 
@@ -132,10 +141,11 @@ class Point2Pose(Savable):
         Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
         """
         if memory is None:
-            super().add_object(name, *prompt, **more)
+            super().add_object(name, mask, clicks, negative, box)
             return
-        if prompt or more or file_name("object name", name) in self.objects:
-            got = "clicks or a mask, too" if prompt or more else f"{name!r}, which is in use"
+        alone = mask is clicks is negative is box is None
+        if not alone or file_name("object name", name) in self.objects:
+            got = f"{name!r}, which is in use" if alone else "clicks or a mask, too"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")
         if not isinstance(memory, ObjectMemory):
             raise BadInput("add_object with a memory", type(memory).__name__, "a memory, as load_memory reads it")

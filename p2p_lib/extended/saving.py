@@ -14,7 +14,7 @@ from p2p_lib import __version__
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import from_dict
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.memory import ObjectMemory, read_memories, save_memories, save_memory
+from p2p_lib.core.memory import ObjectMemory, camera_words, read_memories, save_memories, save_memory
 from p2p_lib.extended.remembered import Remembered
 from p2p_lib.extended.remembering import memory_of
 from p2p_lib.extended.two_maps import TwoMaps
@@ -88,8 +88,8 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
     def memory(self, name: str, **made_of: Any) -> ObjectMemory:
         """What is known of an object now, to be kept by :func:`p2p_lib.core.memory.save_memory`; before :meth:`close`.
 
-        made_of  plain values that say where it comes from, besides version, seed and day. An object that began with a
-                 memory, and has learnt nothing since, gives that memory as it was
+        made_of  plain values that say where it comes from, besides version, seed, day and camera. An object that began
+                 with a memory, and has learnt nothing since, gives that memory as it was
 
         Raises :class:`BadInput` where too little is known to find it again.
         """
@@ -115,6 +115,7 @@ def memory_in(obj: TwoMaps | ObjectTracker, number: int, **made_of: Any) -> Obje
             return replace(before, name=obj.name)
     today = datetime.now(UTC).date().isoformat()
     origin = {"version": __version__, "seed": obj.config.seed, "date": today}
+    origin["camera"] = camera_words(obj.observer.camera)
     return memory_of(obj.name, known, origin | made_of, before)
 
 

@@ -25,7 +25,7 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, evenly
 from p2p_lib.datasets.images import save_png
-from p2p_lib.offline import texture
+from p2p_lib.offline import holes, texture
 from p2p_lib.offline.finished import Finished, Renderer, new_folder
 
 NAME = "textured_simple"
@@ -33,8 +33,8 @@ NAME = "textured_simple"
 _MIN_COMPONENT = 0.05
 #: A patch is open if depth this far behind it, m, was measured in at least so many views.
 _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
-#: Parts and holes that a surface seen all around has at most, once those that nobody saw are closed.
-_PARTS, _HOLES = 1, 10
+#: More holes than this are the raggedness of what was hardly seen.
+_HOLES = 10
 #: Faces of a collision mesh, at most.
 _HULL_FACES = 256
 #: The edge of a texture, px, at least and at most, and the room around its charts.
@@ -99,7 +99,7 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     render = Renderer(surface.vertices, surface.faces, camera)
     views = texture.chosen_rows(made, name, kept, render)
     seen = [(T, made.sequence.frame(view.frame).depth_m) for view in views[::3] for T in [view.T_cam_obj]]
-    shape = simplified(closed(cleaned(surface), camera, seen), faces)
+    shape = whole(cleaned(surface), faces, camera, seen)
     textured = with_texture(shape, views, camera)
     out.mkdir(parents=True)
     write_obj(textured, out)
@@ -111,13 +111,25 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     about = _about(made, name, textured, len(views), off) | {"collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     guessed = f", {100 * about['guessed_share']:.0f} % of its area guessed" if shape.guessed.any() else ""
-    line = f"{name}: {len(shape.faces)} faces, texture of {len(views)} views{guessed}{no_better(off)}"
-    parts, holes = about["parts"], about["holes"]
-    if parts <= _PARTS and holes <= _HOLES:
-        return line
-    fix = "" if made.about.get("offline") else "a model of RUN/offline (p2p refine RUN) or "
-    found = f"{parts} part{'s' * (parts > 1)}, {holes} holes"
-    return f"{line}; ragged ({found}): {fix}a video that shows each side longer and nearer has fewer"
+    textured_of = f"texture of {len(views)} view{'s' * (len(views) != 1)}"
+    line = f"{name}: {len(shape.faces)} faces, {textured_of}{guessed}{no_better(off)}"
+    return line + how_open(about["parts"], about["holes"], about["largest_hole_m"], bool(made.about.get("offline")))
+
+
+def how_open(parts: int, count: int, largest_m: float, offline: bool) -> str:
+    """What there is to say of a model that is not one closed surface; nothing of one that is.
+
+    parts, count, largest_m  its parts, its holes, and how far the largest is across
+    offline                  whether it is of an offline run already
+    """
+    found = [f"in {parts} parts"] * (parts > 1)
+    if count:
+        found.append(f"open: {count} hole{'s' * (count > 1)}, the largest {100 * largest_m:.1f} cm across")
+    told = "".join(f"; {one}" for one in found)
+    if parts == 1 and count <= _HOLES:
+        return told
+    fix = "" if offline else "a model of RUN/offline (p2p refine RUN) or "
+    return f"{told}: {fix}a video that shows each side longer and nearer has fewer"
 
 
 def no_better(off: dict[str, float]) -> str:
@@ -140,8 +152,9 @@ def _about(made: Finished, name: str, textured: Textured, views: int, off: dict[
     }
     record |= {"guessed_share": float(mesh.area_faces[shape.guessed].sum() / mesh.area), "views": views}
     sides_m = sorted(oriented_box(mesh)[1].tolist(), reverse=True)
-    parts, holes = torn(shape)
-    record |= {"parts": parts, "holes": holes, "size_m": np.round(sides_m, 5).tolist(), "colour_error_of_255": off}
+    parts, across_m = torn(shape)
+    record |= {"parts": parts, "holes": len(across_m), "largest_hole_m": round(float(across_m.max(initial=0)), 5)}
+    record |= {"size_m": np.round(sides_m, 5).tolist(), "colour_error_of_255": off}
     return record | {"run": made.about}
 
 
@@ -181,19 +194,32 @@ def _tensor(shape: Shape) -> Any:
     return open3d.t.geometry.TriangleMesh(open3d.core.Tensor(vertices), open3d.core.Tensor(faces))
 
 
+def whole(shape: Shape, faces: int, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> Shape:
+    """The shape closed where no views (T_cam_obj, depth_m) looked through, of at most so many faces."""
+    full, most = closed(shape, camera, views), faces
+    # Where an open or a thin surface is simplified it may tear, and what closes it counts, too.
+    while len((made := closed(simplified(full, most), camera, views)).faces) > faces and most > faces // 2:
+        most -= len(made.faces) - faces
+    return made
+
+
 def closed(shape: Shape, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> Shape:
-    """The shape with its holes filled where no views (T_cam_obj, depth_m) looked through."""
-    tensor = _tensor(shape)  # whose memory holds what is filled
-    filled = tensor.fill_holes(10.0)
-    vertices, faces = filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()
-    if len(vertices) != len(shape.vertices) or not np.allclose(vertices, shape.vertices, atol=1e-6):
-        return shape
-    known = {tuple(row) for row in np.sort(shape.faces, 1).tolist()}
-    new = faces[[tuple(row) not in known for row in np.sort(faces, 1).tolist()]]
-    patches = [patch for patch in _patches(new) if not _seen_through(vertices[new[patch]], camera, views)]
-    added = new[np.concatenate(patches)] if patches else new[:0]
-    guessed = np.arange(len(shape.faces) + len(added)) >= len(shape.faces)
-    return Shape(shape.vertices, np.concatenate([shape.faces, added]), shape.colours, guessed)
+    """The shape with its holes filled where no views (T_cam_obj, depth_m) looked through.
+
+    Faces at which holes meet, and what else hangs on by a vertex or is small by itself, are left out.
+    """
+    kept = np.flatnonzero(holes.unpinched(shape.faces))
+    patches, face_area = _patches(shape.faces[kept]), shape.mesh.area_faces[kept]
+    area = [face_area[patch].sum() for patch in patches]
+    large = [patch for patch, of in zip(patches, area, strict=True) if of >= _MIN_COMPONENT * max(area)]
+    kept = kept[np.sort(np.concatenate(large))]
+    faces = shape.faces[kept]
+    filled = holes.closing(shape.vertices, faces)
+    new = [patch for patch in filled if not _seen_through(shape.vertices[patch], camera, views)]
+    added = np.concatenate([faces[:0], *new])
+    guessed = np.concatenate([shape.guessed[kept], np.ones(len(added), bool)])
+    used, corner = np.unique(np.concatenate([faces, added]), return_inverse=True)
+    return Shape(shape.vertices[used], corner.reshape(-1, 3), shape.colours[used], guessed)
 
 
 def _patches(faces: np.ndarray) -> list[np.ndarray]:
@@ -207,8 +233,11 @@ def _patches(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def _seen_through(triangles: np.ndarray, camera: Any, views: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Whether enough views measured depth well behind more than a third of the points of a patch (F, 3, 3)."""
+    """Whether enough views measured depth well behind more than a third of the area of a patch (F, 3, 3)."""
     points = np.concatenate([triangles.mean(1), (triangles + triangles.mean(1, keepdims=True)).reshape(-1, 3) / 2])
+    sides = triangles[:, 1:] - triangles[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    area = np.concatenate([area, area.repeat(3)])
     through = 0
     for T_cam_obj, depth_m in views:
         p_cam = se3.transform(T_cam_obj, points)
@@ -216,7 +245,7 @@ def _seen_through(triangles: np.ndarray, camera: Any, views: list[tuple[np.ndarr
         inside = camera.inside(uv_px)
         u, v = nearest_px(uv_px, depth_m.shape)
         behind = inside & (depth_m[v, u] > p_cam[:, 2] + _SEEN_THROUGH_M)
-        through += behind.sum() > max(len(points) / 3, 1)
+        through += area[behind].sum() > area.sum() / 3
     return through >= _SEEN_THROUGH_VIEWS
 
 
@@ -238,15 +267,19 @@ def simplified(shape: Shape, faces: int) -> Shape:
     return Shape(vertices, made, colours, shape.guessed[nearest])
 
 
-def torn(shape: Shape) -> tuple[int, int]:
-    """Into how many parts a shape falls, and how many holes it has: closed lines of edges of one face only."""
+def torn(shape: Shape) -> tuple[int, np.ndarray]:
+    """Into how many parts a shape falls, and how far each of its holes is across, m: closed lines of edges of one face.
+
+    Holes that meet are one.
+    """
+    from scipy.spatial.distance import pdist
     from trimesh.graph import connected_component_labels
 
-    edges = np.sort(shape.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-    edges, faces = np.unique(edges, axis=0, return_counts=True)
-    return tuple(  # type: ignore[return-value]
-        len(np.unique(connected_component_labels(of, len(shape.vertices))[of])) for of in (edges, edges[faces == 1])
-    )
+    edges, faces = np.unique(np.sort(holes.edges(shape.faces), 1), axis=0, return_counts=True)
+    part, hole = (connected_component_labels(of, len(shape.vertices)) for of in (edges, edges[faces == 1]))
+    at = np.unique(edges[faces == 1])
+    rims = [at[hole[at] == k] for k in np.unique(hole[at])]
+    return len(np.unique(part[edges])), np.array([pdist(shape.vertices[rim]).max() for rim in rims])
 
 
 def collision(shape: Shape) -> Any:

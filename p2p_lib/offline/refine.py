@@ -35,7 +35,8 @@ from p2p_lib.core.mesh import save
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
-from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, tum_line
+from p2p_lib.datasets.provenance import code_digest
+from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, read_info, tum_line
 from p2p_lib.offline import OFFLINE_COMMENT
 from p2p_lib.offline.evidence import VideoEvidence, VideoPoses, gather
 from p2p_lib.offline.finished import Finished
@@ -55,25 +56,29 @@ CAUSAL = "causal"
 _CHI2_6 = 20.06
 
 
-def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
+def refine_run(folder: str | Path, progress: bool = False, force: bool = False) -> list[str]:
     """Refine the run in ``folder`` into ``folder/offline``; a line on each object, and where it disagrees.
+
+    force  repeat what was made of the same poses by the same code, which is left as it is otherwise
 
     Objects that an interrupted call has finished are not repeated. Raises :class:`MissingData` and :class:`BadInput`
     where images, masks or tracks are missing.
     """
-    folder = Path(folder)
+    folder = Path(folder).resolve()  # it may lead through the result that is replaced
     made = Finished.of(folder)
     if made.run.info.get("offline"):
         raise MissingData(str(folder), "an offline result already", "Refine the run that it is of.")
     if not load_keypoints(folder):
         raise MissingData(str(folder / "keypoints.npz"), "no tracks were kept", "Was it stopped early? Run it anew.")
     config, stamp = from_toml(folder / "config.toml"), _stamp(folder)
-    parts = folder / _PARTS
+    if not force and stamp.items() <= (read_info(folder / OFFLINE) or {}).items():
+        return ["It was refined from these poses by this code already, and is left as it is; --force does it anew."]
+    parts, of = folder / _PARTS, json.dumps(stamp)
     with writing_alone(folder):
-        if (parts / "of").is_file() and (parts / "of").read_text() != stamp:
+        if (parts / "of").is_file() and (parts / "of").read_text() != of:
             shutil.rmtree(parts)
         parts.mkdir(exist_ok=True)
-        replace_text(parts / "of", stamp)
+        replace_text(parts / "of", of)
         todo = [name for name in made.tracked if not (parts / f"{name}.npz").is_file()]
         passes = 1 + 2 * len(todo) if todo else 0  # over the frames: one for all objects, then two for each
         title = f"refine, {passes} passes over {len(made.frames)} frames"
@@ -86,8 +91,13 @@ def refine_run(folder: str | Path, progress: bool = False) -> list[str]:
     return summary
 
 
-def _stamp(folder: Path) -> str:
-    return hashlib.sha256((folder / "poses.npz").read_bytes()).hexdigest()
+def _stamp(folder: Path) -> dict[str, str]:
+    """From which causal poses, and by which code: what the result says of itself."""
+    code = hashlib.sha256(code_digest().encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        code.update(path.read_bytes())
+    poses = hashlib.sha256((folder / "poses.npz").read_bytes())
+    return {"refined_from": poses.hexdigest(), "refined_by": code.hexdigest()[:12]}
 
 
 # --- one object ----------------------------------------------------------------------------------
@@ -181,8 +191,11 @@ def disagreement(causal: ObjectRun, offline: ObjectRun) -> np.ndarray:
     return squared
 
 
-def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
-    """Put the finished parts together in the place of an earlier offline result; a line on each object."""
+def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
+    """Put the finished parts together in the place of an earlier offline result; a line on each object.
+
+    That is moved into ``parts`` first, and is lost with them.
+    """
     new = parts / "whole"
     shutil.rmtree(new, ignore_errors=True)
     (new / "poses").mkdir(parents=True)
@@ -206,10 +219,12 @@ def _write(made: Finished, parts: Path, stamp: str) -> list[str]:
             shutil.copyfile(made.run.path / file_name, new / file_name)
     if (parts / "meshes").is_dir():
         shutil.copytree(parts / "meshes", new / "meshes")
-    about = {"offline": True, "refined_from": stamp, "masks_in": "..", "disagrees_above_3_sigma": disagrees}
+    about = {"offline": True, **stamp, "masks_in": "..", "disagrees_above_3_sigma": disagrees}
     replace_text(new / "run.json", json.dumps(made.run.info | about, indent=1, ensure_ascii=False) + "\n")
-    shutil.rmtree(made.run.path / OFFLINE, ignore_errors=True)
-    new.rename(made.run.path / OFFLINE)
+    if (there := made.run.path / OFFLINE).exists():
+        shutil.rmtree(parts / "before", ignore_errors=True)
+        there.rename(parts / "before")
+    new.rename(there)
     return summary
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import warnings
 from dataclasses import replace
 
 import cv2
@@ -19,6 +20,8 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import background_share, misfit
+from p2p_lib.datasets.image_sequence import WRITE_K
+from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.sequence import open_sequence
@@ -326,6 +329,36 @@ def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit,
     assert limit in wrong.fix and scale in wrong.fix
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1, None), (0.1, "0.01 (centimetres)"), (5, "0.0002 (TUM RGB-D)")])
+@pytest.mark.parametrize("masks", ["dataset", "clicks"])
+def test_a_run_says_at_its_first_masks_that_depth_is_out_of_range(good, tmp_path, factor, unit, masks):
+    """With the units that would bring it into range, as the check does."""
+    folder = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run(folder, tmp_path / "run", masks=masks, stop=1, progress=False)
+    said = [str(doubt.message) for doubt in caught if "m count" in str(doubt.message)]
+    if unit is None:
+        assert not said
+    else:
+        (line,) = said
+        assert re.match(
+            r"depth of 'box' in frame 0: .* m away \(can .* m\), but 0\.1 to 2\.5 m count\. If it was", line
+        )
+        assert f"(--depth-scale). A unit of {unit}" in line
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.9, False), (1.0, True)])
+def test_a_mask_that_holds_more_of_what_is_far_behind_tells_nothing_of_units(good, tmp_path, recwarn, share, doubted):
+    folder = shutil.copytree(good, tmp_path / "far")
+    depth = cv2.imread(str(folder / "depth/000000.png"), cv2.IMREAD_UNCHANGED)
+    on_it = np.argwhere(open_sequence(good).masks(0)["box"])
+    depth[tuple(on_it[: int(share * len(on_it))].T)] = 3000
+    cv2.imwrite(str(folder / "depth/000000.png"), depth)
+    run(folder, tmp_path / "run", objects=["box"], stop=1, progress=False)
+    assert any("m count" in str(doubt.message) for doubt in recwarn) == doubted
+
+
 def test_a_known_size_tells_what_nothing_else_does(good):
     """The focal length of a lens half as long makes everything twice as wide; all other findings stay as they were."""
     assert "--size NAME=CM" in found(good, "camera").text
@@ -379,7 +412,30 @@ def test_what_is_missing_is_named(good, tmp_path):
         (folder / f"rgb/00000{k}.png").write_bytes(b"\x89PNG IEND")
     findings = check_folder(folder)
     assert [finding.text.partition(":")[0][-10:] for finding in alarms(findings)] == ["000001.png", "000003.png"]
+    replace_it = "Replace it, or leave out both of its images."
+    assert {finding.fix for finding in alarms(findings)} == {f"{replace_it} {SKIP_BAD}"}
+    (folder / "rgb/000000.png").write_bytes(b"\x89PNG IEND")
+    assert alarms(check_folder(folder))[0].text.partition(":")[0].endswith("rgb/000000.png")
+    (folder / "cam_K.txt").unlink()
+    (folder / "depth/000000.png").unlink()
+    assert [(finding.name, finding.fix) for finding in check_folder(folder)] == [
+        ("rgb/", replace_it),
+        ("cam_K.txt", WRITE_K),
+    ]
     assert as_lines(findings, "fine").endswith("To mend first: files")
+
+
+def test_what_mends_it_follows_in_every_layout(good, tmp_path):
+    """In TUM's, too, which is opened as a whole."""
+    folder = shutil.copytree(good, tmp_path / "desk")
+    (folder / "cam_K.txt").unlink()
+    (plain,) = check_folder(folder)
+    for part in ("rgb", "depth"):
+        lines = [f"{k / 30} {part}/{path.name}" for k, path in enumerate(sorted((folder / part).iterdir()))]
+        (folder / f"{part}.txt").write_text("\n".join(lines))
+    (tum,) = check_folder(folder)
+    assert (plain.fix, tum.fix) == (WRITE_K, WRITE_K)
+    assert tum.text.startswith(f"{folder}/cam_K.txt: ") and WRITE_K not in tum.text
 
 
 def test_lines_align_and_remedies_follow_what_they_mend(good):

@@ -427,6 +427,27 @@ def test_a_run_that_a_bad_image_ended_goes_on_without_it(sequence, tmp_path, cap
     assert load_run(tmp_path / "run").objects["object"].frame_index.tolist() == [0, 1, 2, 3, 4, 6, 7]
 
 
+def test_the_first_image_may_be_the_bad_one(sequence, tmp_path, capsys):
+    """By it the size of all is known, and of floats their unit."""
+    for path in (sequence / "depth").iterdir():
+        np.save(path.with_suffix(".npy"), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / np.float32(1000))
+        path.unlink()
+    shutil.copytree(sequence / "gt_mask", sequence / "masks")
+    for bad in ("rgb/0000.png", "depth/0000.npy"):
+        (sequence / bad).write_bytes(b"no image")
+        assert run(sequence, tmp_path / "run", "--format", "folder") == 2
+        assert bad in (err := capsys.readouterr().err) and "p2p run --skip-bad goes on without such frames." in err
+        assert run(sequence, tmp_path / "run", "--format", "folder", "--skip-bad", "--force") == 0
+        (obj,) = load_run(tmp_path / "run").objects.values()
+        assert obj.frame_index.tolist() == list(range(1, FRAMES)) and obj.has_pose.all()
+        shutil.rmtree(tmp_path / "run")
+        shutil.copy(sequence / "rgb/0001.png", sequence / "rgb/0000.png")
+    for path in (sequence / "rgb").iterdir():
+        path.write_bytes(b"no image")
+    assert run(sequence, tmp_path / "run", "--format", "folder", "--skip-bad") == 2
+    assert "rgb: got 8 files that cannot be read" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "masks, kept, told", [("first", False, True), ("first", True, False), ("dataset", False, False)]
 )
@@ -453,6 +474,7 @@ def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(seque
     (sequence / "depth/0001.png").write_bytes(b"torn")
     assert run(sequence, tmp_path / "other", *clicks) == 2
     assert "0001.png" in (err := capsys.readouterr().err) and "A prompt needs this frame." in err
+    assert "Click in another one (p2p click), or give a mask of one." in err and "--skip-bad" not in err
 
 
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):
@@ -528,7 +550,7 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
         cv2.imwrite(str(path), np.full((H, W), 9000 + k, np.uint16))
     assert run(sequence, tmp_path / "out") == 2
     out, err = capsys.readouterr()
-    assert "Next: p2p view" not in out and err.count("\n") == 1
+    assert "Next: p2p view" not in out and err.count("\n") == 2  # at the first masks, and at the end
     assert "object never had a pose (only 0 mask pixels with depth)" in err and "--depth-scale" in err
     assert err.endswith(f"Next: p2p check {sequence}\n")
     assert run(sequence, tmp_path / "out", "--depth-scale", "0.001", "--force") == 2
@@ -568,7 +590,8 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
     assert any(re.match(r"\d+ of 20 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)
-    assert any(re.match(r"ycbineoat +0 of 63 +YCBInEOAT$", line) for line in table)
+    assert any(re.match(r"ycbineoat +0 of 63 +YCBInEOAT, the paper's$", line) for line in table)
+    assert any(re.match(r"ablation +0 of 156 .*; here: ablation_embedded$", line) for line in table)
     assert any(re.match(r"sampling_embedded +18 of 30 ", line) for line in table)
     assert max(map(len, [first, *table])) <= 100
     assert cli.main(["benchmark", "--list", "ycbineoat", "runtime"]) == 0
@@ -1040,7 +1063,7 @@ def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monke
 
 
 def test_an_interrupted_offline_pass_says_how_it_goes_on(tmp_path, capsys, monkeypatch):
-    def interrupted(folder, progress):
+    def interrupted(folder, *how):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("p2p_lib.offline.refine.refine_run", interrupted)
@@ -1170,3 +1193,5 @@ def test_a_doubt_that_repeats_is_said_once_with_its_count(tmp_path, capsys):
     said = [line for line in capsys.readouterr().err.splitlines() if "Is it inverted?" in line]
     whole = "mask of 'object': the whole image in frame"
     assert said == [f"p2p run: {whole} 0. Is it inverted?", f"p2p run: 5 more like: {whole} N. Is it inverted?"]
+    kept = [doubt for doubt in json.loads((tmp_path / "out/run.json").read_text())["doubts"] if "inverted" in doubt]
+    assert kept == [f"{whole} 0. Is it inverted? (5 more like it)"], "nor does it fill the run's record"

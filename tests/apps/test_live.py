@@ -654,6 +654,21 @@ def test_the_live_page_sends_clicks_and_forgets_them(scripted):
     assert (seen["sent"], seen["rows"]) == ({"remove": "board"}, ["board"]), "what is tracked"
 
 
+def test_whoever_is_to_say_something_is_told_when_and_how(folder, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    words = ["live", "--camera", f"folder:{folder}", "--rate", "200", *WORDS]
+    assert cli.main([*words, "--listen"]) == 0
+    first, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("slide runs; objects are told on standard input, a line each: ") and "dropped" in last
+    shown = first.partition(": ")[2].partition(" or ")
+    said = Words(None, print)
+    said.hear(shown[0].replace("[x, y], ...", "[60, 50]"))
+    said.hear(shown[2])
+    assert [(name, prompt is None) for name, prompt in said._pending] == [("mug", False), ("mug", True)]
+    assert cli.main([*words, "--click", "--no-browser"]) == 0
+    assert "standard input" not in capsys.readouterr().err
+
+
 def test_words_that_do_not_fit_are_said_and_change_nothing():
     lines, errors = Lines(), []
     words = Words(lines, errors.append)
@@ -750,7 +765,8 @@ def test_a_camera_of_somebody_elses(folder, tmp_path, capsys, monkeypatch):
 
 def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(folder, tmp_path, capsys, monkeypatch):
     (tmp_path / "odd_cameras.py").write_text(
-        "from p2p_lib import Camera\n"
+        "import numpy as np\n"
+        "from p2p_lib import Camera, Frame\n"
         "closed = []\n"
         "class Ends:\n"
         f"    name, camera = 'ends', Camera.from_K({np.asarray(K).tolist()!r}, {W}, {H})\n"
@@ -764,6 +780,14 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
         "    name = None\n"
         "class Matrix(Ends):\n"
         "    camera = [[1]]\n"
+        "class Unnumbered(Ends):\n"
+        "    index, left = None, 8\n"
+        "    def read(self):\n"
+        "        self.left -= 1\n"
+        f"        image, depth_m = np.zeros(({H}, {W}, 3), np.uint8), np.ones(({H}, {W}))\n"
+        "        return Frame(self.index, 0.0, image, depth_m) if self.left else None\n"
+        "class Stuck(Unnumbered):\n"
+        "    index = 0\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "stdin", io.StringIO())
@@ -777,6 +801,8 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
         ("Breaks", "camera odd_cameras:Breaks: Breaks.read raised OSError: unplugged ("),
         ("Nameless", "camera odd_cameras:Nameless: name: got None"),
         ("Matrix", "camera odd_cameras:Matrix: camera: got list, expected a p2p_lib.Camera"),
+        ("Unnumbered", "frame index: got None, expected a whole number from 0"),
+        ("Stuck", "camera odd_cameras:Stuck: read(): got index 0 after 0, expected an index that increases"),
     ):
         capsys.readouterr()
         assert cli.main(["live", "--camera", f"odd_cameras:{name}", "--listen", *WORDS]) == 2

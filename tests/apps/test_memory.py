@@ -86,14 +86,22 @@ def test_one_that_is_not_there_is_no_fault_of_the_data(learnt, tmp_path, capsys)
     words = ["--start", "170", "--stop", "174", "--memory", str(tmp_path / "cup.npz"), "--out", str(tmp_path / "out")]
     assert main([*CROSSING, *words]) == 2
     out, err = capsys.readouterr()
-    assert "cup never had a pose" in err and "show a side that was learnt, or click on it" in err
+    assert "cup never had a pose" in err
+    assert "show a side that was learnt, or click on it, or it is not in this video. Next" in err
     assert "not scored, the sequence has no truth of cup, only of box, can." in out
 
 
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--memory", "{box}", "--memory", "{box}"], "two of 'box'"),
+        (
+            ["--memory", "{box}", "--memory", "{box}"],
+            "two of 'box': {box} and {box}, expected one an object. Give one of",
+        ),
+        (["--memory", "{box}", "--memory", "{box}"], "under another name: --memory NAME={box}."),
+        (["--memory", "carton="], "'carton='"),
+        (["--memory", "a/b={box}"], "'a/b'"),
+        (["--memory", "carton={maps}"], "a folder of 2, expected one for one name"),
         (["--memory", "{half}"], "half.npz"),
         (["--memory", "{none}"], "no such file"),
         (["--memory", "{box}", "--objects", "cup"], "'cup'"),
@@ -102,6 +110,24 @@ def test_one_that_is_not_there_is_no_fault_of_the_data(learnt, tmp_path, capsys)
 def test_what_does_not_fit_is_said_before_anything_is_written(learnt, tmp_path, capsys, words, said):
     box, half = learnt / "maps/box.npz", tmp_path / "half.npz"
     half.write_bytes(box.read_bytes()[:5000])
-    files = {"box": box, "half": half, "none": tmp_path / "none.npz"}
+    files = {"box": box, "half": half, "none": tmp_path / "none.npz", "maps": box.parent}
     assert main([*CROSSING, *(word.format(**files) for word in words), "--out", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert said.format(**files) in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_one_is_looked_for_under_another_name_and_a_coarser_camera_is_told_of(learnt, tmp_path, monkeypatch, capsys):
+    box, can = learnt / "maps/box.npz", learnt / "maps/can.npz"
+    assert load_memory(box).made_of["camera"]["width"] == 640
+    words = ["--memory", f"carton={box}", "--memory", str(can), "--start", "44", "--stop", "50"]
+    assert main([*CROSSING, *words, "--out", str(tmp_path / "out")]) == 0
+    run = load_run(tmp_path / "out")
+    assert all(run.objects[name].has_pose.any() for name in ("carton", "can"))
+    assert {path.stem for path in (tmp_path / "out/maps").iterdir()} == {"carton", "can"}
+    assert run.info["doubts"] == [] == capsys.readouterr().err.splitlines()
+    finer = replace(load_memory(box), made_of={"camera": {"fx": 2000.0, "width": 1920, "height": 1080}})
+    save_memory(tmp_path / "a=b.npz", finer)  # a path all the same
+    monkeypatch.chdir(tmp_path)
+    assert main([*CROSSING, "--memory", "a=b.npz", "--start", "44", "--stop", "46", "--out", "other"]) in (0, 2)
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "focal" in line]
+    assert told.startswith("p2p run: memory of 'box': learnt with a focal length of 2000 px, looked for with 615 px.")
+    assert load_run(tmp_path / "other").info["doubts"] == [told.removeprefix("p2p run: ")]

@@ -30,6 +30,17 @@ def test_missing_data_is_said_in_few_words(nothing, tmp_path, monkeypatch):
     assert ours == f"  Ours; Ours, from clicks: 0 of 13 sequences; else: {missing}"
 
 
+def test_every_kind_of_reason_is_told(nothing, tmp_path, monkeypatch):
+    """Eight sequences are not there, and the ninth has a mask of its first frame alone."""
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    folder = write_sequence(tmp_path / "YCBInEOAT/mustard0", 6, 2, seed=2)
+    _, *others = sorted((folder / "gt_mask").rename(folder / "masks").iterdir())
+    for mask in others:
+        mask.unlink()
+    _, ours, *_ = readiness("ycbineoat").splitlines()
+    assert "(7 more likewise); ycbineoat/mustard0: masks: there are some of the first frames alone" in ours
+
+
 def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_path):
     (line,) = what_to_fetch(load_benchmark("ycbineoat", tmp_path))
     assert "ycbineoat/mustard0 (737 frames)" in line and "about 22 GB" in line

@@ -48,6 +48,26 @@ def test_a_recording_that_cannot_be_run_is_a_failure_and_the_table_is_there(shel
     assert cli.main(words) == 0
 
 
+def test_failures_of_what_runs_now_or_is_gone_do_not_stay_and_other_folders_are_named(shelf, tmp_path):
+    (shelf / "two/prompts.json").write_text("{}")
+    shutil.copytree(shelf / "two", shelf / "three")
+    out, failures, said = tmp_path / "out", tmp_path / "out/failures", []
+    run_batch(shelf, out, OPTIONS, jobs=1, say=said.append)
+    assert {path.name for path in failures.iterdir()} == {"broken.txt", "two.txt", "three.txt"}
+    assert said == ["No recording, and passed over: notes"]
+    (shelf / "two/prompts.json").unlink()
+    shutil.rmtree(shelf / "three")
+    run_batch(shelf, out, OPTIONS, jobs=1)
+    assert {path.name for path in failures.iterdir()} == {"broken.txt"}
+
+
+def test_a_memory_that_is_none_is_said_before_anything_starts(shelf, tmp_path, capsys):
+    (tmp_path / "broken.npz").write_bytes(b"")
+    words = ["run", "--batch", str(shelf), "--memory", str(tmp_path / "broken.npz"), "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--quiet"]) == 2
+    assert "broken.npz" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 def test_what_is_no_shelf_is_a_sentence(shelf, tmp_path, capsys):
     with pytest.raises(BadInput, match="no recording in it"):
         recordings(shelf / "notes", OPTIONS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.depth import check_metres
-from p2p_lib.core.errors import BadInput, Doubt, MissingBackend, MissingData, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, Doubts, MissingBackend, MissingData, P2PError
 from p2p_lib.core.types import Frame
 
 EVERY = [
@@ -64,3 +64,13 @@ def test_errors_cross_process_borders(error):
     """A worker process hands its error to the parent as a pickle."""
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is type(error) and str(again) == str(error)
+
+
+def test_doubts_that_differ_in_numbers_are_one_but_not_those_of_other_names():
+    doubts = Doubts()
+    told = [doubts.add(f"mask of {name!r} in frame {k}") for k in range(3) for name in ("object_1", "object_2")]
+    assert told == [True, True, False, False, False, False]
+    assert list(doubts) == [f"mask of 'object_{k}' in frame 0 (2 more like it)" for k in (1, 2)]
+    assert doubts.more == [f"2 more like: mask of 'object_{k}' in frame N" for k in (1, 2)]
+    doubts.add("once")
+    assert list(doubts)[-1] == "once" and len(doubts.more) == 2

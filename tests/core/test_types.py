@@ -61,6 +61,13 @@ def test_frame_refuses(rgb, depth, time_s, words):
         Frame(7, time_s, rgb, depth)
 
 
+@pytest.mark.parametrize("index", [None, "a", 1.5, 2.0, -1, True, np.float64(3)])
+def test_a_frame_is_numbered_from_0(index):
+    with pytest.raises(BadInput, match=r"frame index: got .*, expected a whole number from 0"):
+        Frame(index, 0.0, RGB, DEPTH)
+    assert type(Frame(np.int64(3), 0.0, RGB, DEPTH).index) is int
+
+
 def test_values_are_frozen():
     for value in (Frame(0, 0.0, RGB, DEPTH), some_tracks([1]), PoseEstimate("a", 0, 0.0, Status.LOST)):
         with pytest.raises(dataclasses.FrozenInstanceError):

@@ -53,7 +53,19 @@ def test_a_prompt_stays_on_what_it_was_said_of(half):
     np.testing.assert_array_equal(painted.mask, half.masks(3)["box"])
 
 
-@pytest.mark.parametrize("scale", [0, -0.5, 1.5])
+def test_enlarged_and_made_small_again_it_is_what_it_was(half):
+    original = half.original
+    large = Resized(original, 2.0)
+    assert (large.camera.width, large.camera.height) == (1280, 960)
+    again = Resized(large, 0.5)
+    assert again.camera == original.camera
+    back, frame = again.frame(3), original.frame(3)
+    np.testing.assert_array_equal(back.depth_m, frame.depth_m)
+    assert np.abs(back.rgb.astype(float) - frame.rgb).mean() < 2
+    np.testing.assert_array_equal(again.masks(3)["box"], original.masks(3)["box"])
+
+
+@pytest.mark.parametrize("scale", [0, -0.5, 4.5])
 def test_a_scale_that_is_none(scale):
     with pytest.raises(BadInput, match="scale"):
         Resized(open_sequence("synthetic/crossing"), scale)

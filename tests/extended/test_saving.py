@@ -1,6 +1,8 @@
 """A saved tracker is loaded with what was asked for; what is kept of an object says where it comes from."""
 
+import copy
 import json
+import pickle
 import threading
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,6 +15,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.memory import load_memory, read_memories
 from p2p_lib.core.types import Frame
 from p2p_lib.extended import saving
+from p2p_lib.method import pipeline
 from p2p_lib.segmenters import anchored, sam2
 from p2p_lib.trackers.lk import LkTracker
 from tests.fixtures.made_memory import made_memory
@@ -122,6 +125,13 @@ def test_a_file_that_lacks_something_is_refused(saved, tmp_path, key):
         assert "object has no" not in str(error.value) and "argument" not in str(error.value)
 
 
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, pickle.dumps])
+@pytest.mark.parametrize("make", [Point2Pose, pipeline.Point2Pose], ids=["ours", "the paper's"])
+def test_a_copy_is_refused_by_what_to_do_instead(make, how):
+    with make(CAMERA) as method, pytest.raises(TypeError, match=r"save\(path\) .* Point2Pose\.load\(path\)"):
+        how(method)
+
+
 # -- where a memory comes from ------------------------------------------------------------------------
 
 
@@ -145,6 +155,7 @@ def test_what_is_kept_again_says_what_it_began_with():
 def test_it_says_what_it_was_made_with():
     made_of = learnt(sequence="second").made_of
     assert made_of["version"] == __version__ and made_of["seed"] == 7
+    assert made_of["camera"] == {"fx": CAMERA.fx, "width": CAMERA.width, "height": CAMERA.height}
     assert len(made_of["date"]) == len("2025-01-31") and made_of["date"][4] == "-"
     json.dumps(made_of)
 

@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import replace
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -70,6 +71,21 @@ def test_a_reset_forgets_the_objects_of_a_segmenter_that_was_given():
         assert own.names == ("left",)
         method.reset()
         assert method.segmenter is own and not own.names
+
+
+def test_what_an_object_is_told_by_is_named_and_nothing_else_is_taken():
+    told = ["mask", "clicks", "negative", "box"]
+    assert list(signature(Point2Pose.add_object).parameters) == ["self", "name", *told, "memory", "frozen"]
+    assert list(signature(Point2Pose.correct).parameters) == ["self", "name", *told]
+    with Point2Pose(CAMERA, quick()) as method:
+        with pytest.raises(TypeError, match=r"add_object\(\) got an unexpected keyword argument 'klicks'"):
+            method.add_object("left", klicks=3)
+        method.add_object("left", film()[0][1]["left"])  # by its place, too
+        with pytest.raises(TypeError, match=r"correct\(\) got an unexpected keyword argument 'click'"):
+            method.correct("left", click=3)
+        with pytest.raises(BadInput, match="add_object with a memory: got clicks or a mask, too"):
+            method.add_object("right", clicks=[[1, 1]], memory=made_memory())
+        assert method.step(film()[0][0])["left"].T_cam_obj is not None and list(method.objects) == ["left"]
 
 
 def test_a_second_thread_is_told_so_and_nothing_has_changed():
@@ -146,7 +162,7 @@ def test_a_prediction_refuses_what_it_cannot_answer():
             method.predict("mug", 1.0)
         method.add_object("left")
         assert method.predict("left", 1.0) is None
-        for no_time in (None, "1"):
+        for no_time in (None, "1", True):
             with pytest.raises(BadInput, match=r"predict time_s: got .*, expected a time in seconds"):
                 method.predict("left", no_time)
         for frame, masks in film()[:3]:

@@ -15,7 +15,7 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.core.raycasting import SurfaceDistance
 from p2p_lib.core.types import evenly
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
-from p2p_lib.offline import model, texture
+from p2p_lib.offline import holes, model, texture
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -32,7 +32,7 @@ def models(made, tmp_path_factory):
         surface.visual.vertex_colors = np.full((len(surface.vertices), 3), 128, np.uint8)
         save(surface, run / "meshes" / f"{name}.ply")
     said = write_product(run, "model", folder / "out", faces=3000)
-    assert "ragged" not in said
+    assert "open" not in said and "texture of 1 views" not in said
     return folder / "out"
 
 
@@ -50,7 +50,8 @@ def test_other_libraries_open_them_in_metres(made, models):
         hull = trimesh.load(models / name / "collision.obj")
         assert hull.is_watertight and hull.is_convex and len(hull.faces) <= 256
         about = json.loads((models / name / "model.json").read_text())
-        assert about["units"] == "m" and (about["parts"], about["holes"]) == (1, 0)
+        assert about["units"] == "m" and about["watertight"]
+        assert (about["parts"], about["holes"], about["largest_hole_m"]) == (1, 0, 0)
         # Of a body however it lies in its frame: here turned and shifted.
         sides_m = sorted(trimesh.Trimesh(true).bounding_box_oriented.primitive.extents, reverse=True)
         np.testing.assert_allclose(about["size_m"], sides_m, atol=0.005)
@@ -154,13 +155,87 @@ def test_files_tell_what_is_guessed_from_what_was_seen(tmp_path):
     assert sum(line.startswith("f ") for line in lines[lines.index("g guessed") :]) == shape.guessed.sum() > 0
 
 
+def test_a_hole_is_looked_through_by_its_area_not_by_its_many_small_faces():
+    camera, ahead = Camera(300, 300, 79.5, 59.5, 160, 120), se3.from_rt(np.eye(3), np.array([0, 0, 0.3]))
+    x, y = np.linspace(0.04, 0.05, 41), np.array([-0.05, 0.05])
+    lid = np.array(
+        [[[-0.05, y[0], 0], [0.04, y[0], 0], [0.04, y[1], 0]], [[-0.05, y[0], 0], [0.04, y[1], 0], [-0.05, y[1], 0]]]
+    )
+    low, high = (np.stack([x, np.full(41, at), 0 * x], 1) for at in y)
+    strip = np.concatenate([np.stack([low[:-1], low[1:], high[1:]], 1), np.stack([low[:-1], high[1:], high[:-1]], 1)])
+    depth_m = np.full((120, 160), 0.35, np.float32)
+    depth_m[:, 118:] = 0.3  # where the strip of small faces is
+    for depths, open_ in (([depth_m] * 3, True), ([depth_m], False), ([np.full_like(depth_m, 0.3)] * 3, False)):
+        views = [(ahead, depth) for depth in depths]
+        assert model._seen_through(np.concatenate([lid, strip]), camera, views) == open_
+
+
+def tin(columns=400, rows=20):
+    """A tin of radius 5 cm and height 10 cm, open above."""
+    k, turn = np.arange(columns), 2 * np.pi * np.arange(columns) / columns
+    ring = 0.05 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
+    wall = [ring + np.array([0, 0, 0.1 * row / rows]) for row in range(rows + 1)]
+    low, after = columns * np.arange(rows)[:, None], (k + 1) % columns
+    a, b, c, d = low + k, low + after, low + columns + k, low + columns + after
+    sides = [np.stack(of, -1).reshape(-1, 3) for of in ((a, b, d), (a, d, c))]
+    bottom = np.stack([np.full(columns, columns * (rows + 1)), after, k], 1)
+    return trimesh.Trimesh(np.concatenate([*wall, np.zeros((1, 3))]), np.concatenate([*sides, bottom]), process=False)
+
+
+def as_shape(mesh):
+    n = len(mesh.vertices), len(mesh.faces)
+    return model.Shape(np.array(mesh.vertices), np.array(mesh.faces), np.zeros((n[0], 3)), np.zeros(n[1], bool))
+
+
+def test_a_large_ragged_hole_is_closed_and_stays_closed_with_fewer_faces():
+    """Its rim has more than 500 edges, and other holes meet it and each other at vertices."""
+    mesh, camera = tin(), Camera(300, 300, 79.5, 59.5, 160, 120)
+    mesh.update_faces(mesh.triangles_center[:, 2] < 0.098 - 0.018 * np.random.default_rng(0).random(len(mesh.faces)))
+    there = holes.unpinched(mesh.faces)
+    assert max(map(len, holes.rims(mesh.faces[there]))) > 500 < (~there).sum()
+    shut = model.closed(as_shape(mesh), camera, [])
+    for made in (shut, model.whole(as_shape(mesh), 2000, camera, [])):
+        parts, across_m = model.torn(made)
+        assert parts == 1 and not len(across_m) and made.mesh.is_watertight and made.mesh.is_winding_consistent
+        assert np.pi * 0.05**2 * 0.08 < made.mesh.volume < np.pi * 0.05**2 * 0.09
+        guessed = made.vertices[made.faces[made.guessed]].reshape(-1, 3)
+        assert guessed[:, 2].min() > 0.07 and np.linalg.norm(guessed[:, :2], axis=1).max() < 0.0505
+    assert len(made.faces) <= 2000
+
+
+def test_what_is_simplified_stays_whole():
+    """A sheet without thickness, closed by its back, tears where the two touch; a splinter is no part of it."""
+    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.1, 0.1, 41))
+    k, camera = np.arange(41 * 41).reshape(41, 41), Camera(300, 300, 79.5, 59.5, 160, 120)
+    a, b, c, d = k[:-1, :-1].ravel(), k[:-1, 1:].ravel(), k[1:, :-1].ravel(), k[1:, 1:].ravel()
+    splinter = np.array([[0, 41 * 41, 41 * 41 + 1]])
+    vertices = np.concatenate([np.stack([x, y, 0 * x], -1).reshape(-1, 3), [[-0.11, -0.1, 0], [-0.1, -0.11, 0]]])
+    sheet = trimesh.Trimesh(vertices, np.concatenate([np.c_[a, b, d], np.c_[a, d, c], splinter]), process=False)
+    full = model.closed(as_shape(sheet), camera, [])
+    assert model.torn(full)[0] == 1 and np.abs(full.vertices).max() < 0.101
+    assert len(model.torn(model.simplified(full, 300))[1]), "what this test is about"
+    few = model.whole(as_shape(sheet), 300, camera, [])
+    assert model.torn(few)[0] == 1 and few.mesh.is_watertight and len(few.faces) <= 300
+
+
 def test_parts_and_holes_are_counted():
     whole, opened = model.closed(box(), Camera(300, 300, 79.5, 59.5, 160, 120), []), box()
-    assert model.torn(whole) == (1, 0) and model.torn(opened) == (1, 1)
+    (parts, none), (one, across_m) = model.torn(whole), model.torn(opened)
+    assert (parts, len(none), one) == (1, 0, 1)
+    np.testing.assert_allclose(across_m, [0.1 * 2**0.5])
     n = len(whole.vertices)
     two = np.concatenate([whole.faces, n + opened.faces])
     pair = model.Shape(np.tile(whole.vertices, (2, 1)), two, np.tile(whole.colours, (2, 1)), np.zeros(len(two), bool))
-    assert model.torn(pair) == (2, 1)
+    parts, across_m = model.torn(pair)
+    assert (parts, len(across_m)) == (2, 1)
+
+
+def test_what_is_open_is_told_however_few_holes_it_has():
+    assert model.how_open(1, 0, 0.0, False) == ""
+    assert model.how_open(1, 1, 0.123, True) == "; open: 1 hole, the largest 12.3 cm across"
+    torn = model.how_open(2, 12, 0.02, False)
+    assert torn.startswith("; in 2 parts; open: 12 holes, the largest 2.0 cm across: a model of RUN/offline")
+    assert "refine" not in model.how_open(2, 0, 0.0, True)
 
 
 def test_fewer_faces_keep_the_shape_and_what_is_guessed():
@@ -210,8 +285,10 @@ def test_exposure_is_evened_out():
 
 def test_a_texture_that_is_no_better_than_vertex_colours_is_told(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(model, "errors", lambda *of: {"texture": 16.34, "vertex_colours": 15.52, "frames": 12})
-    monkeypatch.setattr(model.texture, "chosen_rows", lambda *of: [])  # which take their time
+    chosen = texture.chosen_rows  # of one row: all take their time
+    monkeypatch.setattr(texture, "chosen_rows", lambda made, name, rows, of: chosen(made, name, rows[:1], of))
     told = write_product(finished, "model", tmp_path / "out", faces=100)
+    assert "texture of 1 view," in told
     assert ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)" in told
     assert model.no_better({"texture": 9.0, "vertex_colours": 15.5}) == ""
 

@@ -286,6 +286,52 @@ def test_an_interrupted_pass_goes_on(tracked, monkeypatch):
         np.testing.assert_allclose(after[name].T_cam_obj, moved, equal_nan=True)
 
 
+@pytest.fixture
+def as_they_were(monkeypatch):
+    """A pass that leaves every pose as it was; in which objects it has been, in turn."""
+    did = []
+
+    def part(made, name, config, evidence, parts, bar):
+        did.append(name)
+        T = made.run.objects[name].T_cam_obj
+        np.savez(parts / f"{name}.npz", T_cam_obj=T, causal=np.zeros(len(T), bool))
+
+    monkeypatch.setattr(offline, "_part", part)
+    monkeypatch.setattr(offline, "gather", lambda made, names, *_: dict.fromkeys(names))
+    return did
+
+
+def test_what_was_refined_already_is_left_as_it_is(tracked, as_they_were, monkeypatch, capsys):
+    words, written = ["refine", str(tracked), "--quiet"], tracked / "offline/run.json"
+    assert cli.main(words) == cli.main([*words, "--force"]) == 0 and as_they_were == 2 * ["box", "can"]
+    before, _ = written.stat().st_ino, capsys.readouterr()
+    assert cli.main(words) == 0 and len(as_they_were) == 4 and written.stat().st_ino == before
+    assert "left as it is; --force does it anew" in capsys.readouterr().out.splitlines()[0]
+    with_covariances(tracked, "box")
+    assert cli.main(words) == 0 and len(as_they_were) == 6, "other poses"
+    monkeypatch.setattr(offline, "code_digest", lambda: "another")
+    assert cli.main(words) == 0 and len(as_they_were) == 8, "other code"
+
+
+def test_a_path_may_lead_through_the_result_that_is_replaced(tracked, as_they_were, monkeypatch):
+    offline.refine_run(tracked)
+    (tracked / "offline/mine.txt").write_text("of the first pass")
+    offline.refine_run(tracked / "offline/..", force=True)
+    assert (tracked / "offline/run.json").is_file() and not (tracked / "offline/mine.txt").exists()
+    (tracked / "offline/mine.txt").write_text("of the second")
+    rename = type(tracked).rename
+
+    def not_written(path, to):
+        if path.name == "whole":
+            raise OSError("no space is left")
+        return rename(path, to)
+
+    monkeypatch.setattr(type(tracked), "rename", not_written)
+    with pytest.raises(OSError, match="no space"):
+        offline.refine_run(tracked, force=True)
+    assert (tracked / offline._PARTS / "before/mine.txt").is_file(), "not deleted before the new one is in its place"
+
+
 def with_covariances(folder, name):
     """The run in a folder says of each pose of an object that it is good to half a degree and 3 mm."""
     arrays = dict(np.load(folder / "poses.npz"))

@@ -152,6 +152,26 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
         assert RIGHT[int(found[2]), int(found[1])]
 
 
+@pytest.mark.parametrize(
+    ("clicks", "named"),
+    [
+        ([[110, 100], [130, 120], [175, 110]], (175, 110)),
+        ([[110, 100], [175, 110]], (175, 110)),  # of two, the last
+        ([[175, 110], [110, 100], [130, 120]], (175, 110)),
+        ([[110, 100], [130, 120], [100, 125]], None),
+    ],
+)
+def test_a_click_on_another_thing_is_named(clicks, named):
+    frame = picture()
+    frame.depth_m[RIGHT] += 0.06  # a step of depth and of colour
+    cutter = Cutter(frame, CAMERA, preset().segmentation, Prompt("left", points_px=clicks), np.zeros((0, 2)))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        doubt_start(cutter, LEFT | RIGHT if named else LEFT, {})
+    said = [re.search(r"alone, the click at \((\d+), (\d+)\) selects something else", str(w.message)) for w in caught]
+    assert [tuple(map(int, found.groups())) for found in said if found] == ([named] if named else [])
+
+
 def test_all_others_that_belong_to_what_is_clicked_are_named():
     prompts = [Prompt(name, points_px=[at]) for name, at in (("a", [100, 90]), ("b", [140, 130]), ("c", [120, 110]))]
     with warnings.catch_warnings(record=True) as caught:

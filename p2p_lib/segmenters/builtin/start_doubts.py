@@ -8,8 +8,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import doubt
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import bounds, in_mask
 from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, plane_heights, support_plane
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
 
@@ -17,6 +18,8 @@ from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
 _FLAT = 2.0
 #: Two masks are parted by an edge if the mean tie along their contact is at most this; it is 1 between like pixels.
 _TIED = 0.02
+#: Of more clicks one that is astray does little harm, and each takes a cut.
+_FEW = 10
 #: Two cuts are equally good if their doubts differ by less than the first factor, and show different things if their
 #: sizes differ by more than the second. Two masks are the same from this intersection over union on.
 _AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
@@ -45,6 +48,9 @@ def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarra
         fix = "If they are one object, leave one out; else give each a negative click on the other."
         for other in one_body:
             doubt(who, f"the prompt selects most of {other!r}, too", fix)
+    elif (astray := _astray(cutter)) is not None:
+        got = f"alone, the click at ({astray[0]}, {astray[1]}) selects something else than the others do"
+        doubt(who, got, "If it is not on the object, leave it out, or make it a negative click.")
     elif (another := _as_good(cutter, mask, others)) is not None:
         pixels, (u, v) = another
         got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
@@ -71,6 +77,27 @@ def _one_body(cutter: Cutter, patch: Patch, inside: np.ndarray, others: Mapping[
         return []
     alone = replace(cutter, others_px=NO_PX).cuts[0].whole(cutter.frame.shape)
     return [other for other, there in touched.items() if (alone & there).sum() > there.sum() / 2]
+
+
+def _astray(cutter: Cutter) -> tuple[int, int] | None:
+    """A click (u, v) of the fewer, where clicks fall apart: what one part selects alone holds no click of the other.
+
+    On one object a click alone selects what most of the others are on, though rarely all of it.
+    """
+    clicks = cutter.prompt.points_px
+    clicks = clicks[np.isfinite(depths_at(clicks, cutter.frame))]
+    part = np.arange(len(clicks))
+    for k, click in enumerate(clicks if len(clicks) <= _FEW else ()):
+        if (part == part[0]).all():
+            return None
+        alone = replace(cutter, prompt=replace(cutter.prompt, points_px=click[None])).cuts[0]
+        linked = in_mask(clicks, alone.whole(cutter.frame.shape))
+        part[np.isin(part, part[linked])] = part[k]
+    parts, size = np.unique(part, return_counts=True)
+    if len(parts) < 2 or len(clicks) > _FEW:
+        return None
+    u, v = clicks[part == parts[::-1][size[::-1].argmin()]][-1].astype(int)
+    return int(u), int(v)
 
 
 def _as_good(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> tuple[int, tuple[int, int]] | None:

@@ -1,0 +1,59 @@
+"""The unit of depth images: whether things stand where depth counts, and which unit would put them there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.types import Frame
+
+#: Metres per unit of depth images in the field, likeliest first, and whose they are.
+UNITS_M = {
+    0.001: "millimetres",
+    1.0: "metres",
+    1 / 5000: "TUM RGB-D",
+    1 / 4000: "1/4000 m, as of some LiDAR cameras",
+    0.0001: "tenths of millimetres, as of YCB-Video and short-range stereo",
+    1e-6: "micrometres",
+    0.01: "centimetres",
+}
+#: Where things stand that are tracked, m.
+_STANDS_M = (0.15, 5.0)
+#: Fraction of a mask that should have a depth.
+MEASURED_SHARE = 0.5
+
+
+def likely_units(median_m: float, scale: float) -> str:
+    """The units of the field that bring a depth to where things stand before a camera, likeliest first, in words."""
+    fits = [(unit, what, median_m * unit / scale) for unit, what in UNITS_M.items() if not np.isclose(unit, scale)]
+    fits = [(unit, what, m) for unit, what, m in fits if _STANDS_M[0] <= m <= _STANDS_M[1]][:3]
+    units = [f"{unit:g} ({what}) would make it {m:.2g} m" for unit, what, m in fits]
+    return f"A unit of {', of '.join(units)}" if units else ""
+
+
+def distance_m(frame: Frame, mask: np.ndarray) -> float:
+    """Median depth of what is measured of a mask; NaN where nothing is, or too little of it."""
+    depth_m = frame.depth_m[mask]
+    measured = depth_m[depth_m > 0]
+    enough = len(measured) and len(measured) >= MEASURED_SHARE * len(depth_m)
+    return float(np.median(measured)) if enough else float("nan")
+
+
+def beyond(away_m: Mapping[str, float], limits: DepthConfig, scale: float) -> tuple[str, str] | None:
+    """What to say of objects that are all too far away, or all too near, and what to do: most likely a wrong unit.
+
+    away_m  object to its distance
+    scale   metres per unit, as depth was read
+    """
+    distances, ((_, first_m), *others) = np.array(list(away_m.values())), away_m.items()
+    far = bool((distances > limits.max_m).all())
+    if not far and not (distances < limits.min_m).all():
+        return None
+    text = f"{first_m:.2f} m away"
+    text += f" ({', '.join(f'{name} {other_m:.2f} m' for name, other_m in others)})" if others else ""
+    text += f", but {limits.min_m:g} to {limits.max_m:g} m count"
+    guess = f". {units}" if (units := likely_units(first_m, scale)) else ""
+    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
+    return text, f"If it was, --set depth.{wider}; if it was not, the depth scale is wrong (--depth-scale){guess}."
