@@ -2,7 +2,7 @@
 
 :mod:`p2p_lib.offline.finished` opens a run with its images, masks and surfaces, and says which poses are trusted; look
 there first. ``adjustment.py``, ``loops.py`` and :mod:`p2p_lib.offline.refine` are ``p2p refine``; ``dataset.py``,
-``model.py`` and ``texture.py`` are ``p2p export``.
+``model.py``, ``holes.py`` and ``texture.py`` are ``p2p export``.
 """
 
 #: What ``p2p export`` writes besides files of poses.

@@ -17,6 +17,10 @@ def test_a_box_in_closed_form():
     np.testing.assert_allclose(found["t_hit"], [0.7, 0.35, np.inf, np.inf], rtol=1e-6)
     assert (found["primitive_ids"] >= 0).tolist() == [True, True, False, False]
     np.testing.assert_allclose(found["primitive_normals"], [[0, 0, -1], [0, 0, -1], [0, 0, 0], [0, 0, 0]], atol=1e-6)
+    each = cast(
+        ray_scene(box.vertices, box.faces), eye + np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0], [0, 0, 0]]), rays
+    )
+    np.testing.assert_allclose(each["t_hit"], [0.7, 0.25, np.inf, np.inf], rtol=1e-6)
     corners = box.vertices[box.faces[found["primitive_ids"][0]]]
     assert np.allclose(corners[:, 2], -0.3)
 
