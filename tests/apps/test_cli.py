@@ -587,6 +587,7 @@ def test_a_benchmark_without_its_data_says_so_first(tmp_path, capsys, monkeypatc
     assert cli.main(["benchmark", "ycbineoat", "--out", str(tmp_path), "--quiet"]) == 2
     first, *_, last = capsys.readouterr().err.splitlines()
     assert "$P2P_DATA is not set" in first and "--quick" in first and "nothing ran" in last
+    monkeypatch.setenv("COLUMNS", "200")  # a test's worker may have a narrow one
     assert cli.main(["benchmark", "--list"]) == 0
     first, *table = capsys.readouterr().out.splitlines()
     assert any(re.match(r"\d+ of 20 plans can run here and now in full; \d+ of \d+ methods", line) for line in table)

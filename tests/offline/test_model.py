@@ -32,7 +32,7 @@ def models(made, tmp_path_factory):
         surface.visual.vertex_colors = np.full((len(surface.vertices), 3), 128, np.uint8)
         save(surface, run / "meshes" / f"{name}.ply")
     said = write_product(run, "model", folder / "out", faces=3000)
-    assert "open" not in said and "texture of 1 views" not in said
+    assert "open: " not in said and "texture of 1 views" not in said
     return folder / "out"
 
 
