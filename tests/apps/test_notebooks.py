@@ -311,6 +311,8 @@ def test_pages_link_to_what_was_run_and_to_more_once_that_was_run(tmp_path):
 def test_progress_is_told(run):
     lines = run[3]
     assert lines[0].startswith("3 notebooks, profile quick, results in ")
+    begun = [line.removesuffix(" ...") for line in lines if line.endswith(" ...")]
+    assert sorted(begun[:2]) == ["01_fails", "02_last"], "two at a time: the long ones, which are last, first"
     assert any(line.startswith("00_first: ") and line.endswith(" s, 3 claims checked") for line in lines)
     assert any(line.startswith("01_fails: ") and line.endswith("FAILED") for line in lines)
 

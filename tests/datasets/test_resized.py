@@ -57,6 +57,8 @@ def test_enlarged_and_made_small_again_it_is_what_it_was(half):
     original = half.original
     large = Resized(original, 2.0)
     assert (large.camera.width, large.camera.height) == (1280, 960)
+    blocks = large.frame(3).rgb.reshape(480, 2, 640, 2, 3)
+    assert np.ptp(blocks, axis=(1, 3)).max() > 5, "colour is interpolated, not repeated"
     again = Resized(large, 0.5)
     assert again.camera == original.camera
     back, frame = again.frame(3), original.frame(3)

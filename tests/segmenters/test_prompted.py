@@ -159,6 +159,7 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
         ([[110, 100], [175, 110]], (175, 110)),  # of two, the last
         ([[175, 110], [110, 100], [130, 120]], (175, 110)),
         ([[110, 100], [130, 120], [100, 125]], None),
+        ([*([100 + k, 100] for k in range(10)), [175, 110]], None),  # one of many does little harm
     ],
 )
 def test_a_click_on_another_thing_is_named(clicks, named):
