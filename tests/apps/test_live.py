@@ -443,34 +443,33 @@ class Lines:
         self.typed = queue.Queue()
 
     def __iter__(self):
-        return iter(self.typed.get, None)
+        while (line := self.typed.get()) is not None:
+            yield line
+            self.typed.task_done()
 
 
 def followed_in_step(folder: Path, before, settings=SETTINGS, **how) -> list[PoseEstimate]:
-    """The estimates of a live run that is given each frame when the one before was tracked, after ``before(index)``."""
-    sequence, got = open_sequence(folder), []
-    step = Point2Pose.step
+    """The estimates of a live run that is given each frame when it asks for it, after ``before(index)``."""
+    sequence, got, asked = open_sequence(folder), [], queue.Queue()
 
     class InStep(Scripted):
+        next = 0
+
         def read(self):
-            k = self.next
-            self.next += 1
-            while k > 0 and self.done.get(timeout=20) != k - 1:
-                pass
+            asked.get(timeout=20)
+            k, self.next = self.next, self.next + 1
             before(k)
             return sequence.frame(k) if k < 14 else None
 
-    camera = InStep(sequence.camera)
-    camera.next, camera.done = 0, queue.Queue()
-
-    def stepped(self, frame, masks=None):
-        estimates = step(self, frame, masks)
-        camera.done.put(frame.index)
-        return estimates
+    class Asking(Newest):
+        def take(self):
+            asked.put(True)  # all of the frame before is done: it has been tracked, told of and shown
+            return super().take()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Point2Pose, "step", stepped)
+        patch.setattr("p2p_lib.apps.live.Newest", Asking)
         patch.setattr("p2p_lib.apps.live._warm_up", lambda method: None)
+        camera = InStep(sequence.camera)
         track_live(camera, (), got.append, RunOptions(settings=settings), backlog=20, **how)
     return got
 
@@ -481,9 +480,7 @@ def typed_for(script: dict[int, str], lines: Lines):
     def type_for(k):
         if k in script:
             lines.typed.put(script[k])
-            while lines.typed.qsize():
-                time.sleep(0.001)
-            time.sleep(0.02)
+            lines.typed.join()  # it has been heard
 
     return type_for
 
