@@ -79,23 +79,32 @@ class Reacquisition(Frontend):
         super().segment(self._recalled(inputs))
 
     def _recalled(self, inputs: FrameInputs) -> FrameInputs:
-        """With the mask of a remembered object, if it is found: one of them is looked for in each frame."""
+        """With the masks of remembered objects that are found: of those that are away each frame looks for one.
+
+        For all, while nothing has a pose: then no other object waits for it.
+        """
         known = {n: obj for n, obj in sorted(self.maps.items()) if isinstance(obj, Remembered) and obj.recalls}
         sought = [name for name in known if name in inputs.masks and name not in inputs.prompts]
-        if not sought:
-            return inputs
-        self._turn += 1
-        name = sought[self._turn % len(sought)]
-        others = [mask for other, mask in self.masks.items() if other != name and mask is not None]
+        if sought and any(obj.life.has_pose for obj in self.maps.values()):
+            self._turn += 1
+            sought = [sought[self._turn % len(sought)]]
+        for name in sought:
+            inputs = self._recall(name, known[name], inputs)
+        return inputs
+
+    def _recall(self, name: str, known: Remembered, inputs: FrameInputs) -> FrameInputs:
+        """With the mask of one remembered object, if it is found."""
+        masks = self.masks | {n: mask for n, mask in inputs.masks.items() if mask is not None}
+        others = [mask for other, mask in masks.items() if other != name and mask is not None]
         with self.stopwatch("search"):
-            found = known[name].find(inputs.frame, inputs.masks[name], either(others) if others else None)
-        if known[name].forsaken:
-            self.apply({name: known[name].withdraw()})
+            found = known.find(inputs.frame, inputs.masks[name], either(others) if others else None)
+        if known.forsaken:
+            self.apply({name: known.withdraw()})
             if name in self.segmenter.names:
                 self.segmenter.remove(name)
         if found is None:
             return inputs
-        self.tracks = follow(known[name], found, self.tracker, self.tracks)
+        self.tracks = follow(known, found, self.tracker, self.tracks)
         self._sightings = {**self._sightings, name: found.sighting}
         return replace(inputs, masks=inputs.masks | {name: found.mask})
 

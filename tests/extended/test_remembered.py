@@ -362,12 +362,20 @@ def test_what_is_found_in_one_image_and_elsewhere_in_the_next_is_not_claimed(cro
 
 
 def test_one_that_is_seen_here_and_there_does_not_keep_another_waiting(crossing, learnt, monkeypatch):
-    method = Point2Pose(crossing.camera)
-    for name in ("box", "elsewhere"):  # which is looked for first
+    """All are looked for in each frame while nothing has a pose; later one in each, those left in turn."""
+    method, looks = Point2Pose(crossing.camera), []
+    for name in ("box", "elsewhere", "nowhere"):
         method.add_object(name, memory=replace(learnt.memory, name=name))
     lead_astray(method.objects["elsewhere"], monkeypatch)
-    told = followed(crossing, method, range(45, 49))[-1]
-    assert told["box"].T_cam_obj is not None and told["elsewhere"].T_cam_obj is None
+    for name in ("elsewhere", "nowhere"):
+        find = method.objects[name].find
+        found = (lambda *asked: None) if name == "nowhere" else find
+        monkeypatch.setattr(method.objects[name], "find", lambda *a, n=name, f=found: looks.append(n) or f(*a))
+    told = followed(crossing, method, range(45, 47))[-1]
+    assert [name for name, one in told.items() if one.T_cam_obj is not None] == ["box"]
+    assert looks == 2 * ["elsewhere", "nowhere"]
+    followed(crossing, method, range(47, 51))
+    assert sorted(looks[4:6]) == sorted(looks[6:]) == ["elsewhere", "nowhere"]
 
 
 def test_nothing_is_taken_for_two_objects(crossing, learnt):
