@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, prompts_file, prompts_places, uses_clicks
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError, did_you_mean
 from p2p_lib.core.files import read_toml
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.paths import data_dir
@@ -175,6 +175,9 @@ def _present(planned: PlannedSequence) -> Iterator[tuple[PlannedSequence, str]]:
     if not names:
         yield planned, f"{dataset}: no sequence in {of.folder} below $P2P_DATA"
     columns = _columns(root / COLUMNS)
+    for name in sorted(columns.keys() - set(names)) if names else ():
+        expected = f"sequences in {root}: {', '.join(names)}"
+        raise BadInput(str(root / COLUMNS), f"[{name}]", expected, did_you_mean(name, names))
     for name in names:
         filled = columns.get(name, planned.columns)
         yield planned.model_copy(update={"name": f"{dataset}/{name}", "columns": filled}), ""

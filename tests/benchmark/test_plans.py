@@ -209,6 +209,11 @@ def test_whose_folders_are_which_rows_a_file_beside_them_says(tmp_path, monkeypa
         assert [one.column_of("thing") for one, _ in _present(own)] == ["the plan's", column]
         assert not methods[True] & methods[False], "of the paper's files, or of ours"
         assert not methods[True] & {"Ours, exact depth", "Ours, sensor noise"}
+        (root / "columns.toml").write_text(f'[bb]\nthing = "{column}"\n')
+        with pytest.raises(
+            BadInput, match=r"columns\.toml: got \[bb\], expected sequences in .*: a, b\. Did you mean b\?"
+        ):
+            jobs_of(plan, "full")
         (root / "columns.toml").write_text(f'b = "{column}"\n')
         with pytest.raises(BadInput, match=r"columns\.toml: got b: .*, expected a table \[SEQUENCE\] each"):
             jobs_of(plan, "full")
