@@ -1,4 +1,4 @@
-"""The texture of a model: each texel the mean of sharp views all around, weighted by how well they show it.
+"""The texture of a model: each texel what most of the sharp views all around have there, by how well they show it.
 
 The exposure of the views is evened out first: a gain per view and channel, from points that several of them show. What
 no view shows keeps the surface's own colour.
@@ -6,7 +6,7 @@ no view shows keeps the surface's own colour.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,8 +18,8 @@ from p2p_lib.core.image import nearest_px
 from p2p_lib.core.types import evenly
 from p2p_lib.offline.finished import Finished, Renderer
 
-#: Views that a texture is baked from, at most.
-VIEWS = 48
+#: Views that a texture is baked from, at most, each the sharpest of so many near it.
+VIEWS, _SHARPEST_OF = 96, 2
 #: One in so many frames with a trusted pose is held out of the texture, to measure its error.
 HELD_OUT_EVERY = 10
 #: A pixel shows a surface point that is at most so far behind the rendered depth, if that is at most so far off the
@@ -29,6 +29,8 @@ _BEHIND_M, _MEASURED_M = 0.004, 0.015
 _FACING = 0.25
 #: Pixels along a mask's border that may belong to something else.
 _BORDER_PX = 3
+#: So often a texel's colours are weighed anew by how near they are to its colour; as near as this is as good, of 255.
+_REWEIGHED, _NEAR = 3, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ def view_of(made: Finished, name: str, row: int, render: Renderer) -> View:
 
 
 def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer) -> list[View]:
-    """Of the frames ``rows`` the sharpest of up to four near each of :data:`VIEWS` directions that lie far apart."""
+    """Of the frames ``rows`` the sharpest of some near each of :data:`VIEWS` directions that lie far apart."""
     T_obj_cam = se3.inverse(made.run.objects[name].T_cam_obj[rows])
     way = T_obj_cam[:, :3, 3] / np.linalg.norm(T_obj_cam[:, :3, 3], axis=1, keepdims=True)
     seeds, far = [0], np.linalg.norm(way - way[0], axis=1)
@@ -71,7 +73,7 @@ def chosen_rows(made: Finished, name: str, rows: np.ndarray, render: Renderer) -
     best: list[View] = []
     for k in range(len(seeds)):
         members = np.flatnonzero(nearest == k)
-        views = (view_of(made, name, int(rows[member]), render) for member in evenly(members, 4))
+        views = (view_of(made, name, int(rows[member]), render) for member in evenly(members, _SHARPEST_OF))
         sharpest = max(views, key=lambda view: view.sharpness)
         best += [sharpest] if sharpest.sharpness > 0 else []
     return best
@@ -97,7 +99,9 @@ def sampled(view: View, camera: Camera, p_obj: np.ndarray, normal: np.ndarray):
 
 def lookup(image: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
     """(N, 3) an image (H, W, 3) interpolated at (N, 2), in parts, since OpenCV limits the columns of an image."""
-    parts = np.array_split(uv_px.astype(np.float32), -(-len(uv_px) // 30_000) or 1)
+    if not len(uv_px):
+        return np.zeros((0, image.shape[2]), image.dtype)
+    parts = np.array_split(uv_px.astype(np.float32), -(-len(uv_px) // 30_000))
     return np.concatenate([cv2.remap(image, p[None, :, 0], p[None, :, 1], cv2.INTER_LINEAR)[0] for p in parts])
 
 
@@ -120,27 +124,41 @@ def evened(views: list[View], camera: Camera, p_obj: np.ndarray, normal: np.ndar
     return [replace(view, rgb=np.clip(view.rgb / np.exp(g), 0, 255).astype(np.float32)) for view, g in zip(views, gain)]
 
 
-def baked(views: Iterable[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 of surface points (N, 3): the mean of views, weighted by how well each shows it, else ``own``.
+def baked(
+    views: Collection[View], camera: Camera, p_obj: np.ndarray, normal: np.ndarray, own: np.ndarray
+) -> np.ndarray:
+    """(N, 3) uint8 of surface points (N, 3): near the median of views, weighted by how well each shows it, or ``own``.
 
-    A mean, not the best view: its pose is off by a pixel or two, and so is that of the next image.
+    A reflection, or a finger, is elsewhere in most views. Not the best view: its pose is off by a pixel or two, and so
+    is that of the next image.
     """
-    total, weight = np.zeros((len(p_obj), 3), np.float32), np.zeros(len(p_obj), np.float32)
-    for view in views:
-        rows, colour, shown = sampled(view, camera, p_obj, normal)
-        w = shown.astype(np.float32)
-        total[rows] += w[:, None] * colour
-        weight[rows] += w
-    found = weight > 0
-    colour = np.where(found[:, None], total / np.where(found, weight, 1)[:, None], own)
-    return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
+    colour = np.zeros((len(p_obj), 3), np.float32)
+    for weighed in range(1 + _REWEIGHED):
+        total, weight = np.zeros_like(colour), np.zeros(len(p_obj), np.float32)
+        for view in views:
+            rows, seen, shown = sampled(view, camera, p_obj, normal)
+            w = shown.astype(np.float32)
+            if weighed:  # iteratively reweighted least squares, for the least sum of distances
+                w /= _NEAR + np.abs(seen - colour[rows]).mean(1)
+            total[rows] += w[:, None] * seen
+            weight[rows] += w
+        found = weight > 0
+        colour[found] = total[found] / weight[found, None]
+    return np.clip(np.rint(np.where(found[:, None], colour, own)), 0, 255).astype(np.uint8)
 
 
 def colour_error(view: View, rendered: np.ndarray, shown: np.ndarray) -> float:
-    """Mean absolute difference (0 to 255) of a rendered image (H, W, 3) where it is ``shown`` (H, W), gains evened."""
+    """Mean absolute difference (0 to 255) of a rendered image (H, W, 3) where it is ``shown`` (H, W).
+
+    Under the gains, one per channel, by which it is least: the medians of the ratios, weighted by what is multiplied.
+    """
     use = view.shows & shown
     if use.sum() < 50:
         return float("nan")
-    mine, true = rendered[use].astype(float), view.rgb[use].astype(float)
-    gain = np.median(true, axis=0) / np.maximum(np.median(mine, axis=0), 1)
+    mine, true = np.maximum(rendered[use], 1).astype(float), view.rgb[use].astype(float)
+    ratio = true / mine
+    order = ratio.argsort(0)
+    below = np.take_along_axis(mine, order, 0).cumsum(0)
+    middle = (below < below[-1] / 2).sum(0)
+    gain = np.take_along_axis(ratio, order, 0)[middle, np.arange(3)]
     return float(np.abs(np.clip(mine * gain, 0, 255) - true).mean())

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -254,31 +255,60 @@ def test_of_one_direction_the_sharpest_frame_is_taken(monkeypatch):
     nothing = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), bool), np.zeros((1, 1), np.float32)
     monkeypatch.setattr(texture, "view_of", lambda *of: texture.View(of[2], T[of[2]], *nothing, sharpness[of[2]]))
     chosen = [view.frame for view in texture.chosen_rows(made, "box", np.arange(40), None)]
-    looked_at = [evenly(np.arange(20), 4), evenly(np.arange(20, 40), 4)]
+    looked_at = [evenly(of, texture._SHARPEST_OF) for of in (np.arange(20), np.arange(20, 40))]
     assert chosen == [rows[sharpness[rows].argmax()] for rows in looked_at]
 
 
-def test_what_shows_a_point_better_counts_more():
-    camera, T = Camera(300, 300, 79.5, 59.5, 160, 120), se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+CAMERA = Camera(300, 300, 79.5, 59.5, 160, 120)
+TOWARDS, HALF_A_METRE = np.array([[0, 0, -1.0]]), se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
+
+
+def grey_views(*greys_and_sharpness):
+    """Views of a plane at half a metre, each of one grey and sharpness."""
     depth_m, shows = np.full((120, 160), 0.5, np.float32), np.ones((120, 160), bool)
-    views = [
-        texture.View(k, T, np.full((120, 160, 3), grey, np.float32), shows, depth_m, sharpness)
-        for k, (grey, sharpness) in enumerate(((100, 9.0), (200, 1.0)))
+    return [
+        texture.View(k, HALF_A_METRE, np.full((120, 160, 3), grey, np.float32), shows, depth_m, sharpness)
+        for k, (grey, sharpness) in enumerate(greys_and_sharpness)
     ]
-    p, towards = np.zeros((1, 3)), np.array([[0, 0, -1.0]])
-    assert (texture.baked(views, camera, p, towards, np.zeros((1, 3))) == 110).all()
-    assert (texture.baked([], camera, p, towards, np.full((1, 3), 7)) == 7).all()
+
+
+def test_what_shows_a_point_better_counts_more():
+    own, p = np.full((1, 3), 7.0), np.zeros((1, 3))
+    sharp_first, sharp_last = (
+        texture.baked(grey_views((100, one), (102, other)), CAMERA, p, TOWARDS, own) for one, other in ((9, 1), (1, 9))
+    )
+    assert (sharp_first == 100).all() and (sharp_last == 102).all()
+    assert (texture.baked([], CAMERA, p, TOWARDS, own) == 7).all()
+
+
+def test_a_reflection_that_few_views_have_is_left_out():
+    views = grey_views(*((40, 1.0),) * 7, *((220, 1.0),) * 3)
+    assert (texture.baked(views, CAMERA, np.zeros((1, 3)), TOWARDS, np.zeros((1, 3))) <= 48).all()  # their mean is 94
+
+
+def test_a_colour_error_is_of_the_best_gains():
+    """As a search over gains finds them; a quarter of it is of another colour, as a print is."""
+    rng = np.random.default_rng(0)
+    (view,) = grey_views((0, 1.0))
+    rendered = np.where(rng.random((120, 160, 1)) < 0.25, [200, 40, 90], [30, 160, 120]) + rng.integers(
+        0, 9, (120, 160, 3)
+    )
+    true = rendered * [0.8, 1.1, 1.3] + rng.normal(0, 4, rendered.shape)
+    view.rgb[:] = true
+    least = [
+        min(np.abs(rendered[..., c] * g - view.rgb[..., c]).mean() for g in np.linspace(0.7, 1.4, 701))
+        for c in range(3)
+    ]
+    assert np.isclose(texture.colour_error(view, rendered.astype(np.uint8), view.shows), np.mean(least), atol=0.01)
+    assert np.isnan(texture.colour_error(view, rendered.astype(np.uint8), np.zeros_like(view.shows)))
 
 
 def test_exposure_is_evened_out():
-    camera = Camera(300, 300, 79.5, 59.5, 160, 120)
     rng = np.random.default_rng(0)
     print_ = cv2.resize(rng.uniform(60, 180, (12, 16, 3)).astype(np.float32), (160, 120))
-    T = se3.from_rt(np.eye(3), np.array([0, 0, 0.5]))
-    depth_m, shows = np.full((120, 160), 0.5, np.float32), np.ones((120, 160), bool)
-    views = [texture.View(k, T, print_ * gain, shows, depth_m, 10.0) for k, gain in enumerate((0.8, 1.0, 1.25))]
+    views = [replace(view, rgb=print_ * gain) for view, gain in zip(grey_views(*[(0, 10.0)] * 3), (0.8, 1.0, 1.25))]
     p = np.stack([*rng.uniform(-0.08, 0.08, (2, 500)), np.zeros(500)], 1)
-    even = texture.evened(views, camera, p, np.tile([0, 0, -1.0], (500, 1)))
+    even = texture.evened(views, CAMERA, p, np.tile(TOWARDS, (500, 1)))
     for view in even:
         assert np.abs(view.rgb[10:-10, 10:-10] / even[1].rgb[10:-10, 10:-10] - 1).max() < 0.02
 
