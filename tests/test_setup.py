@@ -56,7 +56,7 @@ def call(checkout: Path, **environment: str) -> subprocess.CompletedProcess:
         env={"PATH": os.environ["PATH"], **environment},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
 
 

@@ -1116,7 +1116,7 @@ def test_signals(how, code, long, tmp_path):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.02)
     process.send_signal(how)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert process.returncode == code
     assert err == "" if code < 0 else err.startswith("p2p run: interrupted.") and err.endswith("--resume\n")
     loaded = load_run(out)
@@ -1128,7 +1128,7 @@ def test_signals(how, code, long, tmp_path):
 
 def test_as_a_process(tmp_path):
     process = p2p("run", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"))
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=300)
     *waits, said = err.splitlines()
     assert (process.returncode, out, waits) == (2, "", [f"{what} ..." for what in WAITS[:2]])
     assert "nowhere: no such folder" in said and not (tmp_path / "out").exists()
@@ -1177,7 +1177,7 @@ def test_the_installed_command_is_this_one():
     script = Path(sys.executable).with_name("p2p")
     if not script.is_file():
         pytest.skip("p2p is not installed beside this Python")
-    result = subprocess.run([script, "--version"], capture_output=True, text=True, timeout=60, env=os.environ)
+    result = subprocess.run([script, "--version"], capture_output=True, text=True, timeout=300, env=os.environ)
     assert (result.returncode, result.stdout.strip()) == (0, p2p_lib.__version__)
 
 

@@ -69,7 +69,7 @@ class Scripted:
         self.name, self.camera, self.hand, self.closed = "scripted", camera, queue.Queue(), False
 
     def read(self):
-        given = None if self.closed else self.hand.get(timeout=10)
+        given = None if self.closed else self.hand.get(timeout=120)
         if isinstance(given, Exception):
             raise given
         return given
@@ -456,7 +456,7 @@ def followed_in_step(folder: Path, before, settings=SETTINGS, **how) -> list[Pos
         next = 0
 
         def read(self):
-            asked.get(timeout=20)
+            asked.get(timeout=120)
             k, self.next = self.next, self.next + 1
             before(k)
             return sequence.frame(k) if k < 14 else None
@@ -531,7 +531,7 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
     def ask(where, content=None):
         data = None if content is None else json.dumps(content).encode()
         try:
-            with urlopen(Request(page.url + where, data, {"Content-Type": "application/json"}), timeout=20) as answer:
+            with urlopen(Request(page.url + where, data, {"Content-Type": "application/json"}), timeout=120) as answer:
                 return answer.status, answer.read()
         except HTTPError as error:
             return error.code, error.read()

@@ -283,7 +283,7 @@ def test_two_processes_at_once(tmp_path):
     code = "from p2p_lib.synthetic import scenario_dir; print(scenario_dir('crossing', frames=3))"
     env = {"P2P_CACHE": str(tmp_path), "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
     running = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=env, text=True) for _ in "ab"]
-    answers = [p.communicate(timeout=120)[0].strip() for p in running]
+    answers = [p.communicate(timeout=300)[0].strip() for p in running]
     assert [p.returncode for p in running] == [0, 0]
     assert answers[0] == answers[1]
     assert [f.name for f in (tmp_path / "synthetic").iterdir() if f.is_dir()] == [answers[0].rsplit("/", 1)[1]]
