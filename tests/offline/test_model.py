@@ -279,6 +279,9 @@ def test_what_shows_a_point_better_counts_more():
     )
     assert (sharp_first == 100).all() and (sharp_last == 102).all()
     assert (texture.baked([], CAMERA, p, TOWARDS, own) == 7).all()
+    (blind,) = grey_views((50, 9))
+    blind.shows[:] = False
+    assert (texture.baked([blind], CAMERA, p, TOWARDS, own) == 7).all()
 
 
 def test_a_reflection_that_few_views_have_is_left_out():
@@ -287,19 +290,15 @@ def test_a_reflection_that_few_views_have_is_left_out():
 
 
 def test_a_colour_error_is_of_the_best_gains():
-    """As a search over gains finds them; a quarter of it is of another colour, as a print is."""
+    """As a search over gains finds them; a quarter of it is of another colour, as a print is, and in another light."""
     rng = np.random.default_rng(0)
     (view,) = grey_views((0, 1.0))
-    rendered = np.where(rng.random((120, 160, 1)) < 0.25, [200, 40, 90], [30, 160, 120]) + rng.integers(
-        0, 9, (120, 160, 3)
-    )
-    true = rendered * [0.8, 1.1, 1.3] + rng.normal(0, 4, rendered.shape)
-    view.rgb[:] = true
-    least = [
-        min(np.abs(rendered[..., c] * g - view.rgb[..., c]).mean() for g in np.linspace(0.7, 1.4, 701))
-        for c in range(3)
-    ]
-    assert np.isclose(texture.colour_error(view, rendered.astype(np.uint8), view.shows), np.mean(least), atol=0.01)
+    printed = rng.random((120, 160, 1)) < 0.25
+    rendered = np.where(printed, [200, 140, 90], [30, 160, 120]) + rng.integers(0, 9, (120, 160, 3))
+    view.rgb[:] = rendered * np.where(printed, 1.2, [0.8, 1.1, 1.3]) + rng.normal(0, 4, rendered.shape)
+    off = [np.abs(np.clip(rendered * g, 0, 255) - view.rgb).mean((0, 1)) for g in np.linspace(0.7, 1.4, 701)]
+    found = texture.colour_error(view, rendered.astype(np.uint8), view.shows)
+    assert np.isclose(found, np.min(off, axis=0).mean(), atol=0.01)
     assert np.isnan(texture.colour_error(view, rendered.astype(np.uint8), np.zeros_like(view.shows)))
 
 
