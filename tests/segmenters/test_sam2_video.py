@@ -96,7 +96,7 @@ class Watched(sam2_video.Sam2VideoSegmenter):
 
     def _note(self, _module, _inputs, output):
         if hasattr(output, "object_score_logits") and hasattr(output, "frame_idx"):
-            self.logits.append((output.pred_masks.numpy().copy(), float(output.object_score_logits)))
+            self.logits.append((output.pred_masks.cpu().numpy().copy(), float(output.object_score_logits)))
 
 
 @needs_transformers
