@@ -182,6 +182,8 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str):
         if choice := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
             message += _meant(choice[1], re.findall(r"[\w-]+", choice[2]))
+        if re.search(r"unrecognized arguments: .*\.npz", message):  # what a shell makes of maps/*.npz
+            message += ". --memory takes one path: give the run's folder for all of its maps, or repeat it"
         warn(f"{self.prog}: {message.rstrip('.')}{'' if message.endswith('?') else '.'} See {self.prog} --help")
         raise SystemExit(2)
 

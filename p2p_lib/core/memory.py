@@ -20,7 +20,7 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import check_arrays, file_name, load_arrays, of_shape, parse_json, read_text, save_arrays
 
 #: Of the files that this library writes, and reads.
-VERSION = 2
+VERSION = 3
 #: Scales and bytes of a landmark's descriptor, as the recogniser makes and compares them.
 DESCRIPTOR = (2, 128)
 _KIND = "p2p object memory"
@@ -103,6 +103,8 @@ class ObjectMemory:
     T_cam_obj    (V, 4, 4) poses of its keyframes: from where it was seen
     covariance   (6, 6) of the newest keyframe, right tangent of T_cam_obj
     seen_m2      the most that a keyframe showed of it, across the line of sight
+    outline      the share of its outline at which the depth had a step in its keyframes: low for what lies in a
+                 surface, as a book in a stack
     surface      with colours
     made_of      where it comes from: plain values, among them the ``camera`` (:func:`camera_words`), and as ``before``
                  a list of the same of the memories that it began with, the oldest first, whose object frame it is in
@@ -121,12 +123,15 @@ class ObjectMemory:
     T_cam_obj: np.ndarray
     covariance: np.ndarray
     seen_m2: np.ndarray
+    outline: np.ndarray
     surface: SurfaceMemory
     made_of: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         what = f"memory of {file_name('memory name', self.name)!r}"
-        check_arrays(what, self, "numbers", p_obj=(None, 3), T_cam_obj=(None, 4, 4), covariance=(6, 6), seen_m2=())
+        check_arrays(
+            what, self, "numbers", p_obj=(None, 3), T_cam_obj=(None, 4, 4), covariance=(6, 6), seen_m2=(), outline=()
+        )
         n, v = len(self.p_obj), len(self.T_cam_obj)
         if not n or not v:
             fix = "Learn the object from more or sharper frames, or with more texture."
@@ -136,6 +141,7 @@ class ObjectMemory:
         check_arrays(what, self, "numbers", confidence=(n,))
         _check_between(f"{what}: confidence", self.confidence, 0, 1)
         _check_between(f"{what}: seen_m2", self.seen_m2, 0, _FARTHEST_M**2)
+        _check_between(f"{what}: outline", self.outline, 0, 1)
         for T in self.T_cam_obj:
             se3.check(f"{what}: T_cam_obj", T, _POSE_TOLERANCE)
         far_m = np.linalg.norm(self.T_cam_obj[:, :3, 3], axis=1).max()

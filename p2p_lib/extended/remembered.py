@@ -37,8 +37,9 @@ _AGREEING, _RECOGNISED = 8, 0.65
 #: So many poses that look alike are compared by how much of the surface shows.
 _ALIKE = 4
 #: Else under a pose have to show: so many landmarks; this share of a keyframe's (all, divided by the keyframes, at most
-#: by this number); this share of the surface; and depth steps along this share of its outline.
-_FEWEST, _OF_A_VIEW, _VIEWS, _SHARE, _OUTLINE = 4, 0.1, 10, 0.8, 0.45
+#: by this number); this share of the surface; and depth steps along its outline, this share of what its keyframes had,
+#: and of all of it.
+_FEWEST, _OF_A_VIEW, _VIEWS, _SHARE, _OUTLINE, _STEPS = 4, 0.1, 10, 0.8, 0.6, 0.15
 #: Without such a pose, turns of so many keyframes are tried.
 _TURNS = 12
 #: Pixels with depth this near to its surface belong to a found object, m.
@@ -144,28 +145,39 @@ class Remembered(TwoMaps):
 
     def _look(self, frame: Frame, mask: np.ndarray | None, taken: np.ndarray | None) -> Recognition | None:
         """Where it may be in one frame."""
-        memory, best = self._memory, None
-        search = ImageSearch(frame, self.observer.camera, self.config.depth)
+        search, best = ImageSearch(frame, self.observer.camera, self.config.depth), None
         for sighting, recognised in self._sightings(frame, search, mask, taken):
-            where = mask if mask is not None else self._on_surface(frame, sighting.T_cam_obj, sighting.uv_px)
-            if taken is not None and mask is None:
-                if (where & taken).sum() > 0.5 * where.sum():
-                    continue
-                where = where & ~taken
-            if where.sum() < self.config.lifecycle.min_mask_px:
-                continue
-            seen = self._recogniser.at(frame, where, sighting.T_cam_obj, memory.p_obj, memory.descriptors)
-            worth = sighting.share if recognised else len(seen)
-            if best is not None and worth <= best[0]:
-                continue
-            if recognised or _certain(
-                len(seen) / self._fewest, sighting.share, partial(outline_share, frame, where, True)
-            ):
-                best = worth, where, sighting, seen
-        if best is None:
+            judged = self._judged(frame, sighting, recognised, mask, taken)
+            if judged is None and not recognised:
+                judged = self._judged(frame, self._as_landmarks_tell(frame, search, sighting), False, mask, taken)
+            if judged is not None and (best is None or judged[0] > best[0]):
+                best = judged
+        return None if best is None else best[1]
+
+    def _judged(
+        self,
+        frame: Frame,
+        sighting: Sighting | None,
+        recognised: bool,
+        mask: np.ndarray | None,
+        taken: np.ndarray | None,
+    ) -> tuple[float, Recognition] | None:
+        """What a sighting is worth, and what shows of the object under it; None where it does not suffice."""
+        memory = self._memory
+        if sighting is None:
             return None
-        _, where, sighting, seen = best
-        return Recognition(where, sighting, seen)
+        where = mask if mask is not None else self._on_surface(frame, sighting)
+        if taken is not None and mask is None:
+            if (where & taken).sum() > 0.5 * where.sum():
+                return None
+            where = where & ~taken
+        if where.sum() < self.config.lifecycle.min_mask_px:
+            return None
+        seen = self._recogniser.at(frame, where, sighting.T_cam_obj, memory.p_obj, memory.descriptors)
+        steps = partial(outline_share, frame, where, True)
+        if recognised or _certain(len(seen) / self._fewest, sighting.share, float(memory.outline), steps):
+            return sighting.share if recognised else len(seen), Recognition(where, sighting, seen)
+        return None
 
     def _sightings(
         self, frame: Frame, search: ImageSearch, mask: np.ndarray | None, taken: np.ndarray | None
@@ -186,6 +198,17 @@ class Remembered(TwoMaps):
         found = search.among(np.concatenate(poses), sample)
         return [(sighting, False) for sighting in found if sighting.share >= _SHARE]
 
+    def _as_landmarks_tell(self, frame: Frame, search: ImageSearch, sighting: Sighting) -> Sighting | None:
+        """The place of a sighting, with a pose like it on which landmarks in it agree; None where they do not.
+
+        By its shape a part of a plane may lie anywhere in that plane.
+        """
+        pairs = self._recogniser.within(frame, self._on_surface(frame, sighting), self._memory.descriptors)
+        agreeing = self._recogniser.agreeing(pairs, self._memory.p_obj)
+        if len(agreeing) < self._fewest or not self._alike(agreeing.T_cam_obj, sighting.T_cam_obj, 0.0):
+            return None
+        return search.at(agreeing.T_cam_obj, self.policy.shape.sample(self.model))
+
     def _recognised(self, search: ImageSearch, pairs: Any) -> list[Sighting]:
         """Where landmarks agree on a pose and the surface shows: several where something looks alike, or turned.
 
@@ -200,15 +223,15 @@ class Remembered(TwoMaps):
             pairs = pairs.select(~np.isin(pairs.rows, agreeing.rows))
         return [sighting for sighting in found if sighting is not None and sighting.share >= _RECOGNISED]
 
-    def _on_surface(self, frame: Frame, T_cam_obj: np.ndarray, uv_px: np.ndarray) -> np.ndarray:
-        """(H, W) bool: pixels on the surface under a pose that are connected with pixels uv_px (M, 2) on it."""
+    def _on_surface(self, frame: Frame, sighting: Sighting) -> np.ndarray:
+        """(H, W) bool: pixels on the surface under a sighting's pose that are connected with what was found of it."""
         surface = self.model.surface
         assert surface is not None, "a memory has one"
-        distance_m = surface_distance(surface, frame.depth_m, self.observer.camera, T_cam_obj)
+        distance_m = surface_distance(surface, frame.depth_m, self.observer.camera, sighting.T_cam_obj)
         near = (np.abs(distance_m) < _ON_SURFACE_M).astype(np.uint8)
         near = cv2.morphologyEx(near, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         _, label = cv2.connectedComponents(near)
-        u, v = np.rint(uv_px).astype(int).T
+        u, v = np.rint(sighting.uv_px).astype(int).T
         held = np.unique(label[v, u])
         return np.isin(label, held[held > 0])
 
@@ -263,12 +286,12 @@ class Remembered(TwoMaps):
         return not self.policy.frozen and super()._turned_over(obs)
 
 
-def _certain(landmarks: float, share: float, outline: Callable[[], float | None]) -> bool:
-    """Whether landmarks, as a multiple of the fewest, and shares of surface and outline suffice to be the object's.
+def _certain(landmarks: float, share: float, outline: float, steps: Callable[[], float | None]) -> bool:
+    """Whether landmarks, as a multiple of the fewest, the share of the surface, and depth ``steps`` are the object's.
 
-    A bland, smooth surface fits a wall, too: but the depth has no steps there.
+    A bland, smooth surface fits a wall, too: but the depth has no steps there, where the object's ``outline`` had some.
     """
-    return landmarks >= 1 and share >= _SHARE and (outline() or 0.0) >= _OUTLINE
+    return landmarks >= 1 and share >= _SHARE and (steps() or 0.0) >= max(_OUTLINE * outline, _STEPS)
 
 
 def follow(obj: Remembered, found: Recognition, tracker: PointTracker, tracks: Tracks) -> Tracks:

@@ -17,6 +17,7 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_image
 from p2p_lib.core.memory import ObjectMemory, SurfaceMemory
 from p2p_lib.core.types import Frame
+from p2p_lib.extended.agreement import outline_share
 from p2p_lib.method.tsdf import TsdfVolume
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 _LANDMARKS, _SHOWS_M = 1500, 0.01
 #: Voxel weights are cut at this, so that later frames still change the average.
 _MOST_WEIGHT = 200.0
+#: The share of its outline with a depth step of an object whose views show none, and pixels around a view.
+_OUTLINE, _AROUND_PX = 0.75, 8
 #: So many origins are kept: the first, which the object frame is of, and the newest.
 _ORIGINS = 100
 
@@ -47,7 +50,8 @@ def memory_of(name: str, known: Known, made_of: dict[str, Any], before: ObjectMe
     p_obj, descriptors, confidence = (np.concatenate(of) for of in zip(*columns, strict=True))
     kept = np.sort(np.random.default_rng(0).permutation(len(p_obj))[:_LANDMARKS])
     landmarks = p_obj[kept], descriptors[kept], confidence[kept]
-    rest = known.model.views.T_cam_obj, known.model.covariance, np.array(getattr(known.life, "seen_m2", 0.0))
+    outline = np.array(_outline(surface, _OUTLINE if before is None else float(before.outline)))
+    rest = known.model.views.T_cam_obj, known.model.covariance, np.array(getattr(known.life, "seen_m2", 0.0)), outline
     return ObjectMemory(name, *landmarks, *rest, _surface_memory(surface), made_of)
 
 
@@ -80,6 +84,17 @@ def _landmarks(known: Known, surface: TsdfVolume) -> tuple[np.ndarray, ...]:
     if not found:
         return np.zeros((0, 3)), np.zeros((0, 1, 1), np.uint8), np.zeros(0)
     return tuple(np.concatenate(column) for column in zip(*found, strict=True))
+
+
+def _outline(surface: TsdfVolume, unseen: float) -> float:
+    """The share of its outline at which depth has a step, in the middle view; ``unseen`` where no view shows any."""
+    shares = []
+    for view in surface.views.values():
+        depth_m = np.pad(np.where(view.depth_m > 0, view.depth_m, np.float32(0)), _AROUND_PX)
+        frame = Frame(0, 0.0, np.zeros((*depth_m.shape, 3), np.uint8), depth_m)
+        shares.append(outline_share(frame, np.pad(view.inside, _AROUND_PX), own=True))
+    measured = [share for share in shares if share is not None]
+    return float(np.median(measured)) if measured else unseen
 
 
 def _on_surface(surface: TsdfVolume, p_obj: np.ndarray) -> np.ndarray:

@@ -778,6 +778,10 @@ def test_a_damaged_run_is_named(case, done, tmp_path, capsys):
         (["eval"], "DIR"),
         (["rum", "x"], "Did you mean run?"),
         (["run", "x", "--ouput", "y"], "no option --ouput. Did you mean --out?"),
+        (
+            ["run", "x", "--out", "y", "--memory", "a.npz", "b.npz"],
+            "b.npz. --memory takes one path: give the run's folder",
+        ),
         (["check", "x", "--jsn"], "no option --jsn. Did you mean --json? See p2p check --help"),
         (["eval", "x", "--align", "best"], "'best'"),
         (["run", "x", "--out", "y", "--frozen"], "--frozen keeps the maps of --memory"),

@@ -80,6 +80,7 @@ M, N = len(SURFACE.index), len(MADE.p_obj)
         ({"covariance": np.eye(6) + np.eye(6, k=1)}, "covariance: got no covariance"),
         ({"seen_m2": np.float64(-1)}, "seen_m2: got -1 to -1"),
         ({"seen_m2": np.zeros(1)}, "seen_m2: got float64 1, expected numbers alone"),
+        ({"outline": np.float64(1.5)}, "outline: got 1.5 to 1.5, expected 0 to 1"),
         ({"surface_index": SURFACE.index[:, None]}, f"surface: index: got int32 {M} x 1, expected whole numbers any"),
         ({"surface_index": SURFACE.index.astype(float)}, "surface: index: got float64"),
         ({"surface_index": np.int64(3)}, "surface: index: got int64 alone"),
@@ -115,7 +116,7 @@ def test_arrays_that_are_wrong_are_refused(refused, changed, said):
 @pytest.mark.parametrize(
     "head, said",
     [
-        (lambda head: head | {"version": "2"}, 'got version "2", expected a memory .* of version 2. Make it again'),
+        (lambda head: head | {"version": "2"}, 'got version "2", expected a memory .* of version 3. Make it again'),
         (lambda head: head | {"version": None}, "got version null"),
         (lambda head: {k: v for k, v in head.items() if k != "version"}, "got version null"),
         (lambda head: head | {"version": {"a": 3}}, "got version {"),
@@ -139,7 +140,7 @@ def test_a_file_of_another_version_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(memories, "VERSION", memories.VERSION + 1)
     save_memory(tmp_path / "ball.npz", made_memory())
     monkeypatch.undo()
-    with pytest.raises(BadInput, match=r"version 3, expected a memory .* of version 2\. Make it again"):
+    with pytest.raises(BadInput, match=r"version 4, expected a memory .* of version 3\. Make it again"):
         load_memory(tmp_path / "ball.npz")
 
 

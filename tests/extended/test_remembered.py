@@ -12,13 +12,17 @@ from scipy.spatial.transform import Rotation
 from p2p_lib import Point2Pose, open_sequence, preset
 from p2p_lib.core import memory as memories
 from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.memory import ObjectMemory, SurfaceMemory, load_memories, load_memory, save_memory
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.extended.graph import BoundedGraph
-from p2p_lib.extended.image_search import ImageSearch
+from p2p_lib.extended.image_search import ImageSearch, Sighting
 from p2p_lib.extended.remembered import _certain
+from p2p_lib.extended.remembering import _outline
+from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.trackers.builtin.recogniser import Recognised, Recogniser
 from p2p_lib.trackers.rollouts import RolloutTracker
 
@@ -437,9 +441,47 @@ def test_a_mask_of_something_else_founds_no_other_map(learnt, other):
 
 
 def test_few_landmarks_prove_nothing_on_what_does_not_end_where_depth_does():
-    assert _certain(1, 0.9, lambda: 0.6)
-    assert not _certain(5, 0.9, lambda: 0.1) and not _certain(5, 0.9, lambda: None)
-    assert not _certain(0.9, 0.9, lambda: 0.9) and not _certain(5, 0.6, lambda: 0.9)
+    assert _certain(1, 0.9, 0.9, lambda: 0.6)
+    assert not _certain(5, 0.9, 0.9, lambda: 0.3) and not _certain(5, 0.9, 0.9, lambda: None)
+    assert not _certain(0.9, 0.9, 0.9, lambda: 0.9) and not _certain(5, 0.6, 0.9, lambda: 0.9)
+    # What was learnt lying in a surface has few steps there, too; but none at all prove nothing.
+    assert _certain(1, 0.9, 0.3, lambda: 0.25) and not _certain(5, 0.9, 0.0, lambda: 0.1)
+
+
+def test_a_memory_knows_along_how_much_of_its_outline_depth_has_a_step(learnt):
+    assert learnt.memory.outline > 0.95  # it stands free
+
+
+def test_the_outline_of_a_part_of_a_plane_has_no_step_and_of_what_nobody_saw_is_as_before():
+    camera = Camera(500.0, 500.0, 160.0, 120.0, 320, 240)
+    depth_m, mask = np.full((240, 320), 0.6, np.float32), np.zeros((240, 320), bool)
+    mask[80:160, 100:220] = True
+    shares = {}
+    for name, nearer_m in ("book in a stack", 0.0), ("book on a table", 0.05):
+        surface = TsdfVolume(TsdfConfig(voxel_m=0.004))
+        seen_m = np.where(mask, depth_m - np.float32(nearer_m), depth_m)
+        surface.integrate(seen_m, np.zeros((240, 320, 3), np.uint8), mask, camera, np.eye(4), key=0)
+        shares[name] = _outline(surface, 0.3)
+    assert shares["book in a stack"] == 0 and shares["book on a table"] > 0.9
+    assert _outline(TsdfVolume(TsdfConfig(voxel_m=0.004)), 0.3) == 0.3
+
+
+def test_along_a_plane_landmarks_tell_where_it_is(crossing, learnt):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    box, frame = method.objects["box"], crossing.frame(40)
+    sample, search = box.policy.shape.sample(box.model), ImageSearch(frame, crossing.camera, box.config.depth)
+    T_cam_obj = crossing.truth["box"].T_cam_model[40] @ se3.inverse(learnt.T_obj_model)
+
+    def told(R, t_m):
+        """What landmarks tell of a sighting whose pose is off by R, t_m."""
+        T = T_cam_obj @ se3.from_rt(R, np.array(t_m))
+        sighting = Sighting(T, 0.9, crossing.camera.project(se3.transform(T, sample.p_obj)))
+        return box._as_landmarks_tell(frame, search, sighting)
+
+    moved = se3.inverse(T_cam_obj) @ told(np.eye(3), [0.03, 0, 0]).T_cam_obj
+    assert np.linalg.norm(se3.transform(moved, sample.p_obj) - sample.p_obj, axis=1).max() < 0.006
+    assert told(Rotation.from_euler("z", 40, degrees=True).as_matrix(), [0, 0, 0]) is None  # no pose like it
 
 
 def test_the_graph_keeps_landmarks_where_the_memory_has_them():

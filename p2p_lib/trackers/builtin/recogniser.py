@@ -68,6 +68,12 @@ class Recogniser:
         rows, corner = rows[kept], corner[kept]
         return Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner])
 
+    def within(self, frame: Frame, mask: np.ndarray, descriptors: np.ndarray) -> Recognised:
+        """The landmarks (N,) that look like corners in a ``mask`` (H, W)."""
+        found = corners(Image.of(frame, self.camera), inner(mask), _IN_MASK)
+        rows, corner = self._pairs(found, descriptors, np.arange(len(descriptors)), _EXPECTED_RATIO)
+        return Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner])
+
     @staticmethod
     def agreeing(pairs: Recognised, p_obj: np.ndarray) -> Recognised:
         """Of pairs with landmarks (N, 3) those that most agree with on one pose, each landmark and corner once."""
@@ -82,13 +88,11 @@ class Recogniser:
 
         Each looks like its corner, and may be a few pixels beside it: their pose is refit to them all.
         """
-        found = corners(Image.of(frame, self.camera), inner(mask), _IN_MASK)
-        rows, corner = self._pairs(found, descriptors, np.arange(len(p_obj)), _EXPECTED_RATIO)
-        pairs = Recognised(rows, found.uv_px[corner].astype(float), found.p_cam[corner])
-        every, limit_m = np.ones(len(rows)), np.full(len(rows), _AGREE_M)
-        if fit := refit(T_cam_obj, p_obj[rows], pairs.p_cam, limit_m, every, _REFIT, every > 0):
+        pairs = self.within(frame, mask, descriptors)
+        expected, every = p_obj[pairs.rows], np.ones(len(pairs))
+        if fit := refit(T_cam_obj, expected, pairs.p_cam, _AGREE_M * every, every, _REFIT, every > 0):
             return _once(pairs, fit.inliers, fit.T_a_b)
-        near = residual_m(T_cam_obj, p_obj[rows], pairs.p_cam) < _AGREE_M
+        near = residual_m(T_cam_obj, expected, pairs.p_cam) < _AGREE_M
         return _once(pairs, near, T_cam_obj)
 
     def _corners(self, frame: Frame) -> Corners:
