@@ -148,8 +148,9 @@ class Remembered(TwoMaps):
         search, best = ImageSearch(frame, self.observer.camera, self.config.depth), None
         for sighting, recognised in self._sightings(frame, search, mask, taken):
             judged = self._judged(frame, sighting, recognised, mask, taken)
-            if judged is None and not recognised:
-                judged = self._judged(frame, self._as_landmarks_tell(frame, search, sighting), False, mask, taken)
+            told = self._as_landmarks_tell(frame, search, sighting) if judged is None and not recognised else None
+            if told is not None:
+                judged = self._judged(frame, told, False, mask, taken)
             if judged is not None and (best is None or judged[0] > best[0]):
                 best = judged
         return None if best is None else best[1]
@@ -157,15 +158,13 @@ class Remembered(TwoMaps):
     def _judged(
         self,
         frame: Frame,
-        sighting: Sighting | None,
+        sighting: Sighting,
         recognised: bool,
         mask: np.ndarray | None,
         taken: np.ndarray | None,
     ) -> tuple[float, Recognition] | None:
         """What a sighting is worth, and what shows of the object under it; None where it does not suffice."""
         memory = self._memory
-        if sighting is None:
-            return None
         where = mask if mask is not None else self._on_surface(frame, sighting)
         if taken is not None and mask is None:
             if (where & taken).sum() > 0.5 * where.sum():

@@ -21,7 +21,7 @@ from p2p_lib.datasets.resized import Resized
 from p2p_lib.extended.graph import BoundedGraph
 from p2p_lib.extended.image_search import ImageSearch, Sighting
 from p2p_lib.extended.remembered import _certain
-from p2p_lib.extended.remembering import _outline
+from p2p_lib.extended.remembering import _outline, memory_of
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.trackers.builtin.recogniser import Recognised, Recogniser
 from p2p_lib.trackers.rollouts import RolloutTracker
@@ -466,22 +466,34 @@ def test_the_outline_of_a_part_of_a_plane_has_no_step_and_of_what_nobody_saw_is_
     assert _outline(TsdfVolume(TsdfConfig(voxel_m=0.004)), 0.3) == 0.3
 
 
-def test_along_a_plane_landmarks_tell_where_it_is(crossing, learnt):
+def test_along_a_plane_landmarks_tell_where_it_is(crossing, learnt, monkeypatch):
     method = Point2Pose(crossing.camera)
     method.add_object("box", memory=learnt.memory)
     box, frame = method.objects["box"], crossing.frame(40)
     sample, search = box.policy.shape.sample(box.model), ImageSearch(frame, crossing.camera, box.config.depth)
     T_cam_obj = crossing.truth["box"].T_cam_model[40] @ se3.inverse(learnt.T_obj_model)
 
-    def told(R, t_m):
-        """What landmarks tell of a sighting whose pose is off by R, t_m."""
+    def off_by(R, t_m):
+        """A sighting whose pose is off."""
         T = T_cam_obj @ se3.from_rt(R, np.array(t_m))
-        sighting = Sighting(T, 0.9, crossing.camera.project(se3.transform(T, sample.p_obj)))
-        return box._as_landmarks_tell(frame, search, sighting)
+        return Sighting(T, 0.9, crossing.camera.project(se3.transform(T, sample.p_obj)))
 
-    moved = se3.inverse(T_cam_obj) @ told(np.eye(3), [0.03, 0, 0]).T_cam_obj
-    assert np.linalg.norm(se3.transform(moved, sample.p_obj) - sample.p_obj, axis=1).max() < 0.006
-    assert told(Rotation.from_euler("z", 40, degrees=True).as_matrix(), [0, 0, 0]) is None  # no pose like it
+    slid = off_by(np.eye(3), [0.03, 0, 0])
+    monkeypatch.setattr(box, "_sightings", lambda *_: [(slid, False)])
+    for found in box._as_landmarks_tell(frame, search, slid), box._look(frame, None, None).sighting:
+        moved = se3.inverse(T_cam_obj) @ found.T_cam_obj
+        assert np.linalg.norm(se3.transform(moved, sample.p_obj) - sample.p_obj, axis=1).max() < 0.006
+    turned = off_by(Rotation.from_euler("z", 40, degrees=True).as_matrix(), [0, 0, 0])
+    assert box._as_landmarks_tell(frame, search, turned) is None  # no pose like it
+    monkeypatch.setattr(box, "_fewest", 500)
+    assert box._as_landmarks_tell(frame, search, slid) is None  # too few agree
+
+
+def test_a_memory_that_no_view_was_added_to_keeps_its_outline(crossing, learnt):
+    method = Point2Pose(crossing.camera)
+    method.add_object("box", memory=learnt.memory)
+    before = replace(learnt.memory, outline=np.array(0.4))
+    assert memory_of("box", method.objects["box"].own.known, {}, before).outline == 0.4
 
 
 def test_the_graph_keeps_landmarks_where_the_memory_has_them():
