@@ -12,43 +12,33 @@ import numpy as np
 from p2p_lib.core.image import in_image, nearest_px, outline_px
 from p2p_lib.core.types import SPARSE, Frame
 
-#: Keypoints nearer to each other say little of the size, m; so many are needed.
-_APART_M, _KEYPOINTS = 0.02, 8
 #: Pixels that changed by less in each of red, green and blue, in grey levels, look the same.
 _SAME_GREY = 12
-#: At least this share of an image has to look the same.
-_LOOKS_THE_SAME = 0.2
+#: So many places have to tell whether the camera stands still, and at least this share of them that it does.
+_TELLING, _STANDS = 30, 0.4
 #: Depth is compared this many px to either side of the outline, at this many places at least; a step is larger, m.
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
 
 
-def size_ratio(p_obj: np.ndarray, p_cam: np.ndarray, noise_m: np.ndarray) -> tuple[float, float] | None:
-    """Measured size of the object, p_cam (N, 3), over that in its map, p_obj (N, 3), and the standard deviation.
-
-    Scaled or offset depth changes the size; a wrong pose or a few wrong points do not: it is the median over pairs of
-    keypoints. ``noise_m`` (N,) is that of the points; None where too few keypoints are seen.
-    """
-    from scipy.spatial.distance import pdist
-
-    if len(p_obj) < _KEYPOINTS:
-        return None
-    known_m, measured_m = pdist(p_obj), pdist(p_cam)
-    apart = known_m > _APART_M
-    if apart.sum() < _KEYPOINTS:
-        return None
-    sigma = np.sqrt(2 / len(p_obj)) * np.median(noise_m) / np.median(known_m[apart])
-    return float(np.median(measured_m[apart] / known_m[apart])), float(sigma)
-
-
 def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:
-    """Median ratio of depths, now over before, of pixels beside the object that look the same.
+    """Median ratio of depths, now over before, of pixels beside the object that look the same; 1 with a moving camera.
 
-    1 where too few look the same, as with a moving camera.
+    A camera stands still where places that differ from those beside them look the same: of a plain wall all look
+    the same from everywhere. Points that slide over an object, or follow wrong depth, change nothing of it.
     """
     now, now_m, then, then_m = (of.sparse[name] for of in (frame, before) for name in ("rgb", "depth_m"))
-    same = (now_m > 0) & (then_m > 0) & ~(mask[SPARSE] | mask_before[SPARSE])
-    same &= cv2.inRange(cv2.absdiff(now, then), (0,) * 3, (_SAME_GREY - 1,) * 3) > 0
-    return float(np.median(now_m[same] / then_m[same])) if same.mean() > _LOOKS_THE_SAME else 1.0
+    beside = ~(mask[SPARSE] | mask_before[SPARSE])
+    same, around = beside & _alike(now, then), np.ones((3, 3), np.uint8)
+    telling = beside & ~_alike(cv2.dilate(now, around), cv2.erode(now, around))
+    if telling.sum() < _TELLING or same[telling].mean() < _STANDS:
+        return 1.0
+    same &= (now_m > 0) & (then_m > 0)
+    return float(np.median(now_m[same] / then_m[same])) if same.sum() >= _TELLING else 1.0
+
+
+def _alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(H, W) bool: where two images (H, W, 3) look the same."""
+    return cv2.inRange(cv2.absdiff(a, b), (0,) * 3, (_SAME_GREY - 1,) * 3) > 0
 
 
 def outline_share(frame: Frame, mask: np.ndarray, own: bool = False) -> float | None:

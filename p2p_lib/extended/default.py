@@ -55,7 +55,7 @@ MECHANISMS = {
     "sliding_gate": "A flat object, whose surface can slide, needs agreeing points or a matching contour.",
     "contour": "A flat object without texture is registered by the contour of its mask.",
     "rest": "An object left at rest is accepted elsewhere only if enough points agree.",
-    "size": "Nothing is learnt while depth shows the object and the scene at another size.",
+    "scale": "Nothing is learnt while depth shows the resting scene nearer or farther than before.",
     "outline": "Nothing is learnt while the outline of the mask does not follow depth edges.",
     "still": "Nothing is learnt while the camera repeats the same image.",
     # Inside: confidence, graph.
@@ -71,9 +71,9 @@ def chosen(config: Config) -> frozenset[str]:
     """The mechanisms that ``method.mechanisms`` names; :class:`BadInput` for one that is not in the list.
 
     >>> from p2p_lib.core.config import preset
-    >>> some = preset().with_values({"method.mechanisms": "all but size, outline"})
+    >>> some = preset().with_values({"method.mechanisms": "all but scale, outline"})
     >>> sorted(chosen(preset()) - chosen(some)), chosen(preset("paper"))
-    (['outline', 'size'], frozenset())
+    (['outline', 'scale'], frozenset())
     """
     spec = config.method.mechanisms.strip()
     if spec in (ALL, NONE):

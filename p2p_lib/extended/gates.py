@@ -16,8 +16,8 @@ from p2p_lib.method.policy import Verdict
 
 #: Shape and colour have found an object if this share of its surface shows; the second while it has a pose.
 SIGHTED, SIGHTED_STILL = 0.5, 0.3
-#: A size has changed if its ratio is off 1 by this plus so many standard deviations.
-_SIZE, _SIZE_SIGMAS = 0.05, 3.0
+#: Depth of what rests is another if its ratio to that before is off 1 by more.
+_RATIO = 0.05
 #: A mask is doubted if less of its outline is along depth steps than this share of what was before. After so many
 #: doubted frames in a row it is accepted.
 OUTLINE, _LONGEST_DOUBT = 0.45, 60
@@ -33,7 +33,7 @@ class PoseEvidence:
     surface_share  share of the depth points that lie on the surface under it; None where no surface was asked
     sighting       share of the surface that shows in the image where and as it should; None: not looked for
     lead           how much more shows than under the best other turn, as a share; None: not compared
-    size           measured size over that in the map, and its standard deviation; None: size is not in question
+    scene_ratio    depth of the resting scene over that before any doubt
     outline        share of its mask's outline along depth steps, relative to that before any doubt
     still          whether the same image has come again and again
     carried        whether its motion before the gap still says where it is
@@ -46,7 +46,7 @@ class PoseEvidence:
     surface_share: float | None
     sighting: float | None = None
     lead: float | None = None
-    size: tuple[float, float] | None = None
+    scene_ratio: float = 1.0
     outline: float = 1.0
     still: bool = False
     carried: bool = False
@@ -120,23 +120,18 @@ def _mask_off_steps(life: Lifecycle, evidence: PoseEvidence) -> str:
     return "the outline of the mask no longer follows depth edges" if off else ""
 
 
-def _another_size(life: Lifecycle, evidence: PoseEvidence) -> str:
-    ratio, sigma = evidence.size or (1.0, 0.0)
-    return f"depth shows the object {ratio:.2f} times as large as its map" if off_size(ratio, sigma) else ""
+def _another_depth(life: Lifecycle, evidence: PoseEvidence) -> str:
+    ratio = evidence.scene_ratio
+    return f"depth shows what rests {ratio:.2f} times as far away as before" if abs(ratio - 1) > _RATIO else ""
 
 
 def _same_image(life: Lifecycle, evidence: PoseEvidence) -> str:
     return "the camera repeats the same image" if evidence.still else ""
 
 
-def off_size(ratio: float, sigma: float = 0.0) -> bool:
-    """Whether a ratio of sizes or depths differs from 1 by more than its standard deviation ``sigma`` allows."""
-    return abs(ratio - 1) > _SIZE + _SIZE_SIGMAS * sigma
-
-
 #: Every reason to doubt a pose that no gate refuses: state and evidence to words, or "".
 DOUBTS: dict[str, Callable[[Lifecycle, PoseEvidence], str]] = {
-    "size": _another_size,
+    "scale": _another_depth,
     "outline": _mask_off_steps,
     "still": _same_image,
 }

@@ -15,10 +15,10 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, Status
-from p2p_lib.extended.agreement import scene_ratio, size_ratio
+from p2p_lib.extended.agreement import scene_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
-from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge, off_size
+from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge
 from p2p_lib.extended.graph import explained
 from p2p_lib.extended.image_search import laid_on
 from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
@@ -256,14 +256,14 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
     def judge(self, obs: OurObservation, known: OurKnown, best: Candidate) -> Judgement:
         """Whether the pose stands, by its evidence and by the consistency of depth and masks."""
         assert isinstance(best, Proposal) and best.refined is not None
-        size = self._size(obs, known, best) if "size" in self.on else None
+        ratio = self._scene_ratio(obs) if "scale" in self.on else 1.0
         outline = self.outline(obs) if "outline" in self.on else 1.0
         carried = self.carried(known, obs.frame.time_s)
         slides = "sliding_gate" in self.on and may_slide(best.refined, self.config.refinement.min_eigenvalue)
         fit = self._contour(obs, known, best.refined)
         rests = self._rests(obs, known, best) if "rest" in self.on else None
         contour = 0.0 if fit is None else fit.share(best.T_cam_obj)
-        consistent = replace(best.evidence, size=size, outline=outline, still=obs.still, rests=rests)
+        consistent = replace(best.evidence, scene_ratio=ratio, outline=outline, still=obs.still, rests=rests)
         evidence = replace(consistent, carried=carried, slides=slides, contour=contour)
         return judge(known.life, evidence, self.on, self.config.lifecycle)
 
@@ -284,22 +284,13 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         before = self.trusted
         return None if obs.mask is None or before is None or before.mask is None else before
 
-    def _size(self, obs: OurObservation, known: OurKnown, best: Proposal) -> tuple[float, float] | None:
-        """The size ratio and its deviation, if the scene beside the object has changed its depth, too; else None.
-
-        Points that slide over an object change only the object's size.
-        """
+    def _scene_ratio(self, obs: OurObservation) -> float:
+        """How far away the resting scene is measured, over what it was in the newest frame without a doubt."""
         before = self._before(obs)
         if before is None:
-            return None
+            return 1.0
         assert obs.mask is not None and before.mask is not None, "both have one"
-        if not off_size(scene_ratio(obs.frame, obs.mask, before.frame, before.mask)):
-            return None
-        keypoints = known.keypoints(obs)
-        agreeing = keypoints & best.hypothesis.inliers
-        sized = agreeing if 2 * agreeing.sum() > keypoints.sum() else keypoints
-        p_cam = obs.p_cam[sized]
-        return size_ratio(known.map.p_obj[sized], p_cam, self.observer.noise_m(p_cam))
+        return scene_ratio(obs.frame, obs.mask, before.frame, before.mask)
 
     def outline(self, obs: OurObservation) -> float:
         """Share of the mask's outline along depth steps, relative to that in the newest frame without a doubt."""

@@ -85,7 +85,7 @@ def draw_box(
 def draw_axes(image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, length_m: float) -> np.ndarray:
     """A frame's x, y and z axes, the farthest first, in the colours of :data:`style.AXES`."""
     tips = se3.transform(T_cam_obj, np.eye(3) * length_m)
-    for k in np.argsort(-tips[:, 2]):
+    for k in np.argsort(-tips[:, 2], kind="stable"):
         line = np.stack([T_cam_obj[:3, 3], tips[k]])[None]
         image = _stroke(image, _segments(camera, line), style.AXES[k], 2)
     return image

@@ -110,7 +110,7 @@ def rigid(p_a: np.ndarray, p_b: np.ndarray, rng: np.random.Generator) -> tuple[n
     if len(p_a) < 3:
         return none
     within = _within_m(p_a, p_b)
-    sample = np.argsort(rng.random((_SAMPLES, len(p_a))), axis=1)[:, :3]
+    sample = np.argsort(rng.random((_SAMPLES, len(p_a))), axis=1, kind="stable")[:, :3]
     off = residual_m(fit_rigid(p_b[sample], p_a[sample]), p_b, p_a)
     best = np.minimum(off / within, 1).sum(1).argmin()
     agree = off[best] < within

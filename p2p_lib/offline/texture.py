@@ -157,7 +157,7 @@ def colour_error(view: View, rendered: np.ndarray, shown: np.ndarray) -> float:
         return float("nan")
     mine, true = np.maximum(rendered[use], 1).astype(float), view.rgb[use].astype(float)
     ratio = true / mine
-    order = ratio.argsort(0)
+    order = ratio.argsort(0, kind="stable")
     below = np.take_along_axis(mine, order, 0).cumsum(0)
     middle = (below < below[-1] / 2).sum(0)
     gain = np.take_along_axis(ratio, order, 0)[middle, np.arange(3)]

@@ -23,7 +23,8 @@ def resting(mesh: Mesh) -> np.ndarray:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     centre = area @ corners.mean(1) / area.sum()
     down = np.zeros((0, 3))
-    for normal in hull.equations[np.argsort(-area), :3]:
+    # Many faces are as large as others: their order may not hang on the last bit, nor on how a processor sorts.
+    for normal in hull.equations[np.argsort(-area.round(12), kind="stable"), :3]:
         if (down @ normal < np.cos(np.radians(_ALIKE_DEG))).all() and _stands(outline, centre, normal):
             down = np.vstack([down, normal])
     x = np.where(np.abs(down[:, :1]) < 0.8, [[1.0, 0, 0]], [[0, 1.0, 0]])

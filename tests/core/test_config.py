@@ -319,7 +319,7 @@ def value_strategy(key: str) -> st.SearchStrategy:
         case float():
             return st.floats(low, high, allow_nan=False)
         case _:
-            return st.sampled_from(f.metadata.get("choices", ("all", "none", "all but size", "size, outline")))
+            return st.sampled_from(f.metadata.get("choices", ("all", "none", "all but scale", "scale, outline")))
 
 
 changes = st.dictionaries(st.sampled_from(sorted(FIELDS)), st.none()).flatmap(

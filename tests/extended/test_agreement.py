@@ -6,39 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from p2p_lib.core import se3
 from p2p_lib.core.types import Frame
-from p2p_lib.extended.agreement import outline_share, scene_ratio, size_ratio
+from p2p_lib.extended.agreement import outline_share, scene_ratio
 from p2p_lib.extended.frame_guard import StaleFrames
-
-RNG = np.random.default_rng(0)
-P_OBJ = RNG.uniform(-0.05, 0.05, (30, 3))
-T = se3.exp(np.array([0.4, -0.3, 0.8, 0.1, 0.05, 0.7]))
-
-
-@pytest.mark.parametrize("scale", [0.8, 1.0, 1.2])
-def test_the_size_is_that_of_the_depth_wherever_the_object_is(scale):
-    p_cam = scale * se3.transform(T, P_OBJ) + RNG.normal(0, 5e-4, P_OBJ.shape)
-    p_cam[:6] += RNG.normal(0, 0.05, (6, 3))  # wrong points
-    ratio, sigma = size_ratio(P_OBJ, p_cam, np.full(30, 5e-4))
-    assert ratio == pytest.approx(scale, abs=0.02) and sigma < 0.01
-
-
-def test_depth_that_is_offset_shows_it_larger():
-    facing = P_OBJ * [1, 1, 0] + [0, 0, 0.7]
-    ratio, _ = size_ratio(P_OBJ * [1, 1, 0], facing * (1 + 0.15 / 0.7), np.zeros(30))
-    assert ratio == pytest.approx(1 + 0.15 / 0.7)
-
-
-def test_noise_spreads_the_size_by_as_much_as_it_says():
-    noisy = [size_ratio(P_OBJ, P_OBJ + RNG.normal(0, 2e-3, P_OBJ.shape), np.full(30, 2e-3)) for _ in range(200)]
-    ratio, sigma = np.transpose(noisy)
-    assert 0.5 * sigma[0] < ratio.std() < 2 * sigma[0]
-
-
-def test_few_points_or_points_in_one_place_have_no_size():
-    assert size_ratio(P_OBJ[:7], P_OBJ[:7], np.zeros(7)) is None
-    assert size_ratio(0.1 * P_OBJ, P_OBJ, np.zeros(30)) is None
 
 
 def scene(left: int, grey: int = 100, wall_m: float = 0.9) -> tuple[Frame, np.ndarray]:
@@ -49,13 +19,32 @@ def scene(left: int, grey: int = 100, wall_m: float = 0.9) -> tuple[Frame, np.nd
     return Frame(0, 0.0, np.full((40, 80, 3), grey, np.uint8), depth_m), mask
 
 
+def table(left: int, shift: int = 0, contrast: int = 30) -> tuple[Frame, np.ndarray]:
+    """A table at 0.9 m, half of it under a cloth of small squares; a square object of 60 px at 0.5 m; its mask."""
+    squares = np.random.default_rng(0).integers(0, 5, (20, 11)).repeat(16, 0).repeat(16, 1)[:, shift : shift + 160]
+    grey = np.hstack([np.full((320, 160), 60), 60 + contrast * squares]).astype(np.uint8)
+    mask = np.zeros((320, 320), bool)
+    mask[100:160, left : left + 60] = True
+    return Frame(0, 0.0, np.repeat(grey[..., None], 3, 2), np.where(mask, 0.5, 0.9).astype(np.float32)), mask
+
+
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.2])
 def test_a_camera_that_measures_otherwise_does_so_beside_the_object_too(factor):
-    (before, mask_before), (frame, mask) = scene(20), scene(30)
+    (before, mask_before), (frame, mask) = table(100), table(140)
     other = replace(frame, depth_m=np.where(mask, 2.0, factor) * frame.depth_m)
     assert scene_ratio(other, mask, before, mask_before) == pytest.approx(factor), "whatever the object does"
-    moving = replace(other, rgb=other.rgb + np.uint8(40))
-    assert scene_ratio(moving, mask, before, mask_before) == 1, "nothing looks the same"
+    noise = np.random.default_rng(1).integers(-5, 6, other.rgb.shape)
+    noisy = replace(other, rgb=(other.rgb + noise).astype(np.uint8))
+    assert scene_ratio(noisy, mask, before, mask_before) == pytest.approx(factor)
+    assert scene_ratio(replace(other, depth_m=0 * other.depth_m), mask, before, mask_before) == 1, "no depth"
+
+
+@pytest.mark.parametrize("contrast", [0, 30])
+def test_a_camera_that_comes_nearer_measures_no_otherwise(contrast):
+    """Half of the table looks the same from there, and all of a plain one; a cloth does not."""
+    (before, mask_before), (frame, mask) = table(100, 0, contrast), table(100, 16, contrast)
+    assert (before.rgb == frame.rgb).mean() > 0.5
+    assert scene_ratio(replace(frame, depth_m=0.9 * frame.depth_m), mask, before, mask_before) == 1
 
 
 def test_a_mask_ends_where_depth_has_steps():

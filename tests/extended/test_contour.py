@@ -84,7 +84,7 @@ def test_a_contour_hidden_at_first_is_learnt_later(hidden, points, length):
         if not k:
             beside = np.arange(320) > np.median(np.nonzero(mask)[1]) if hidden == "half" else ~mask
             hides = np.broadcast_to(beside, mask.shape)
-            frame.depth_m[hides], mask[hides] = 0.3, False
+            frame.depth_m[hides], frame.rgb[hides], mask[hides] = 0.3, 120, False
             method.add_object("plate", mask=mask)
         T_plate_obj = se3.inverse(truth) @ method.step(frame, {"plate": mask})["plate"].T_cam_obj
         contour = method.objects["plate"].life.contour

@@ -35,13 +35,13 @@ def test_each_mechanism_is_asked_for_by_its_name(name):
 def test_all_and_none():
     assert on("all") == set(MECHANISMS) and on("none") == frozenset()
     assert compose(CAMERA, preset("paper")) == Parts()
-    assert on(" size ,  outline") == {"size", "outline"}
+    assert on(" scale ,  outline") == {"scale", "outline"}
 
 
-@pytest.mark.parametrize("said", ["sizes", "all but sizes", "size outline", ""])
+@pytest.mark.parametrize("said", ["scales", "all but scales", "scale outline", ""])
 def test_an_unknown_mechanism_is_refused_before_anything_is_tracked(said):
     with pytest.raises(BadInput, match=r"config method\.mechanisms: got .*all, none"):
         Point2Pose(CAMERA, preset().with_values({"method.mechanisms": said}))
-    if said == "sizes":
-        with pytest.raises(BadInput, match=r"Did you mean size\?"):
+    if said == "scales":
+        with pytest.raises(BadInput, match=r"Did you mean scale\?"):
             on(said)

@@ -247,10 +247,9 @@ def test_a_return_without_points_is_sought_until_points_confirm_it():
     ("contradiction", "doubted"),
     [
         ({}, False),
-        ({"size": (1.03, 0.0), "outline": 0.6}, False),
-        ({"size": (1.1, 0.01)}, True),
-        ({"size": (0.9, 0.01)}, True),
-        ({"size": (1.1, 0.02)}, False),
+        ({"scene_ratio": 1.04, "outline": 0.6}, False),
+        ({"scene_ratio": 1.1}, True),
+        ({"scene_ratio": 0.9}, True),
         ({"outline": 0.4}, True),
         ({"still": True}, True),
     ],
@@ -266,4 +265,4 @@ def test_what_contradicts_itself_is_doubted_and_the_paper_doubts_nothing(contrad
 def test_a_mask_that_stays_as_wide_is_taken_for_right_in_the_end():
     long, wide = dataclasses.replace(lived(GOOD)[-1], doubted_frames=60), dataclasses.replace(GOOD, outline=0.4)
     assert not judge(long, wide, ALL, CFG).doubted
-    assert judge(long, dataclasses.replace(GOOD, size=(1.2, 0.0)), ALL, CFG).doubted, "an object has one size"
+    assert judge(long, dataclasses.replace(GOOD, scene_ratio=1.2), ALL, CFG).doubted, "what rests stays as far away"

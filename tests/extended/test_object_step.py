@@ -27,7 +27,7 @@ from tests.method.analytic_scene import CAMERA, LUMP, look_from, render
 
 START = look_from((1.0, 0.2, 0.5))
 #: Without what judges poses and keeps frames from being learnt; without motion.
-UNGATED = "all but growing, outgrown, second_map, turns, return_gate, surface_gate, size, outline, still, texture"
+UNGATED = "all but growing, outgrown, second_map, turns, return_gate, surface_gate, scale, outline, still, texture"
 UNGATED += ", sure_keyframes, stray_points"
 UNMOVED = "all but motion_prior, motion_weight, motion_over_gaps, moving_points"
 NO_SURFACE = {"method__surface": False, "refinement__residuals": "none", "method__graph": False}
@@ -363,17 +363,20 @@ def test_what_lay_still_is_out_of_view_where_the_camera_turned_away():
 # --- what is believed, kept and asked for ------------------------------------------------------
 
 
-def test_what_shrinks_an_object_alone_is_no_fault_of_the_camera():
-    """Points that slide over it do."""
+def test_depth_that_changes_where_nothing_moves_is_doubted_until_it_is_as_before():
+    """Also where the points follow it, as those of a tracker that reads depth: to them nothing is wrong."""
     lump = settled(begun(), [2])
-    obs = lump.observed(turned(3))
+    policy, known, obs = lump.tracker.policy, lump.tracker.known, lump.observed(turned(3))
     depth_m = np.where(obs.mask, obs.frame.depth_m, 1.2).astype(np.float32)
-    obs = lump.tracker.policy.trusted = replace(obs, frame=replace(obs.frame, depth_m=depth_m))
-    middle = np.nanmean(obs.p_cam, 0)
-    shrunk, best = replace(obs, p_cam=middle + 0.85 * (obs.p_cam - middle)), Proposal(lump.registered(obs)[0])
-    assert lump.tracker.policy._size(shrunk, lump.tracker.known, best) is None
-    everywhere = replace(shrunk, frame=replace(obs.frame, depth_m=0.85 * depth_m))
-    assert lump.tracker.policy._size(everywhere, lump.tracker.known, best)[0] == pytest.approx(0.85, abs=0.01)
+    best = Proposal(lump.registered(obs)[0])
+    best = replace(best, refined=policy.refine(obs, known, best).refined)
+
+    def judged(depth_m):
+        return policy.judge(replace(obs, frame=replace(obs.frame, depth_m=depth_m, rgb=WALL)), known, best)
+
+    policy.trusted = replace(obs, frame=replace(obs.frame, depth_m=depth_m, rgb=WALL))
+    assert judged(1.2 * depth_m).doubted and "1.20 times as far" in judged(1.2 * depth_m).reason
+    assert not judged(depth_m).doubted and not judged(np.where(obs.mask, 0.85, 1) * depth_m).doubted
 
 
 def test_tracks_that_contradict_the_motion_are_rejected():
@@ -774,12 +777,17 @@ def learnt(lump: Lump) -> list[np.ndarray]:
     return [*(value.copy() for value in counts), model.surface.values(), model.surface.weights()]
 
 
+#: What the colour of a wall is, and of the lump before it.
+WALL = np.random.default_rng(0).integers(0, 240, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
+
+
 def doubtful(lump: Lump, depth=lambda depth_m: depth_m, mask=lambda mask: mask) -> ObjectStep:
     """A turn by which a keyframe is due, with other depth and another mask than the object has."""
     T_cam_model = turned(15)
     depth_m, seen = render(LUMP, T_cam_model)
-    rgb = np.full((*depth_m.shape, 3), 9, np.uint8)
-    frame = Frame(len(lump.steps), len(lump.steps) / 30, rgb, depth(np.where(seen, depth_m, np.float32(0.8))))
+    frame = Frame(
+        len(lump.steps), len(lump.steps) / 30, WALL + np.uint8(9), depth(np.where(seen, depth_m, np.float32(0.8)))
+    )
     return lump.tracker.step(lump.tracker.observe(frame, mask(seen), lump.tracks(T_cam_model)))
 
 
@@ -788,8 +796,7 @@ def before_a_wall(**settings) -> Lump:
     lump = begun(**settings)
     for deg in (3, 6, 9):
         depth_m, seen = render(LUMP, turned(deg))
-        frame = Frame(len(lump.steps), len(lump.steps) / 30, np.zeros((*seen.shape, 3), np.uint8), depth_m)
-        frame = replace(frame, depth_m=np.where(seen, depth_m, np.float32(0.8)))
+        frame = Frame(len(lump.steps), len(lump.steps) / 30, WALL, np.where(seen, depth_m, np.float32(0.8)))
         lump.steps.append(lump.tracker.step(lump.tracker.observe(frame, seen, lump.tracks(turned(deg)))))
     assert lump.steps[-1].estimate.status is Status.TRACKED and lump.steps[-1].estimate.confidence > 0.5
     return lump
@@ -802,8 +809,8 @@ def dilated(mask: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("fault", "word"),
     [
-        ({"depth": lambda depth_m: 1.2 * depth_m}, "1.20 times as large"),
-        ({"depth": lambda depth_m: depth_m + np.float32(0.1)}, "times as large"),
+        ({"depth": lambda depth_m: 1.2 * depth_m}, "1.20 times as far"),
+        ({"depth": lambda depth_m: depth_m + np.float32(0.1)}, "times as far"),
         ({"mask": dilated}, "no longer follows depth edges"),
         ({"depth": lambda depth_m: np.roll(depth_m, 20, 1)}, "no longer follows depth edges"),
     ],

@@ -89,7 +89,7 @@ def test_the_hand_covers_some_of_it_and_never_all(seed):
         at = beside & (together.label > 1)
         inside = cv2.erode(np.where(together.label == 1, together.depth_m, 9.0), np.ones((3, 3)))
         touching.append((np.abs(together.depth_m - inside)[at] < 0.008).any())
-    assert 0.2 < np.max(covered) < 0.75 and 0.03 < np.mean(covered) < 0.5
+    assert 0.2 < np.max(covered) < 0.85 and 0.03 < np.mean(covered) < 0.5
     assert np.mean(touching) > 0.5  # where hand and thing meet there is no step in depth
 
 
@@ -123,7 +123,7 @@ def test_poses_and_depth_agree_on_every_pixel_of_a_mask(name):
 
 
 def test_motion_blurs_the_thing_and_only_then():
-    scenario = film("in_hand", 0)
+    scenario = film("in_hand", 2)  # its thing has a print
     deg, px = steps(scenario)
     room = scenario.empty(0)
     sharp_sensor = Sensor(motion_blur=0.0)
