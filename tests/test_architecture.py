@@ -176,17 +176,6 @@ def test_every_module_imports_without_torch_open3d_and_plots():
     assert ran.stdout.splitlines()[-1:] == ["LOADED"], ran.stdout[-500:] + ran.stderr[-500:]
 
 
-def test_what_is_as_large_as_another_is_sorted_alike_on_every_processor():
-    """Without ``kind="stable"`` the order of ties is the processor's, and films and poses hang on it."""
-    unstable = []
-    for path in sources():
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("argsort", "argpartition"):
-                if {k.arg: getattr(k.value, "value", None) for k in node.keywords}.get("kind") != "stable":
-                    unstable.append(f"{path.relative_to(PROJECT)}:{node.lineno}")
-    assert not unstable, unstable
-
-
 def test_files_tell_nothing_of_a_machine_or_registry():
     told = []
     for path in tracked_files():

@@ -80,11 +80,12 @@ def test_a_contour_hidden_at_first_is_learnt_later(hidden, points, length):
         truth = moved(0.01 * k, 0, 0)
         frame, mask = plate(truth, k)
         print_ = cv2.GaussianBlur(np.roll(grains, 5 * k, 1), (0, 0), 1.5)
-        frame = replace(frame, rgb=np.where(mask[..., None], print_, frame.rgb))
+        wall = frame.rgb + np.uint8(30 * k)  # what hides the plate at first does not look like the wall
+        frame = replace(frame, rgb=np.where(mask[..., None], print_, wall))
         if not k:
             beside = np.arange(320) > np.median(np.nonzero(mask)[1]) if hidden == "half" else ~mask
             hides = np.broadcast_to(beside, mask.shape)
-            frame.depth_m[hides], frame.rgb[hides], mask[hides] = 0.3, 120, False
+            frame.depth_m[hides], mask[hides] = 0.3, False
             method.add_object("plate", mask=mask)
         T_plate_obj = se3.inverse(truth) @ method.step(frame, {"plate": mask})["plate"].T_cam_obj
         contour = method.objects["plate"].life.contour
