@@ -31,14 +31,28 @@ def test_tables_of_the_same_code_get_its_digest_and_say_what_was_compared(same, 
     assert note == {"code": "b", "commit": "c", "same_as": [{"code": "a", "runs compared": 12}]}
 
 
-def test_where_runs_from_clicks_differ_tables_without_them_stand(same, tmp_path):
-    notes = {
+@pytest.fixture
+def notes(tmp_path):
+    """Notes of tables and figures of some plans, and of one that is of no plan."""
+    sources = {
         "readme": {"benchmark": "readme"},
+        "trackers": {"benchmark": "trackers"},
         "faults": {"benchmark": "faults"},
         "rates": {"file": "runtime.csv"},
         "of_readme": {"file": "readme.csv"},
+        "films": {"benchmark": "presets"},
         "drawn": {"run": "2e4bd481b74b"},
     }
-    for name, source in notes.items():
+    for name, source in sources.items():
         (tmp_path / f"{name}.json").write_text(json.dumps({"code": "a", "sources": [source]}))
-    assert same.restamp(tmp_path, "a", "b", 12, clicks=False) == ["drawn.json", "faults.json", "rates.json"]
+    return tmp_path
+
+
+def test_where_runs_from_clicks_differ_tables_without_them_stand(same, notes):
+    stand = same.restamp(notes, "a", "b", 12, clicks=False)
+    assert stand == ["drawn.json", "films.json", "rates.json", "trackers.json"]
+
+
+def test_tables_of_another_film_and_of_faults_do_not_stand(same, notes):
+    stand = same.restamp(notes, "a", "b", 12, films={"synthetic/in_hand"})
+    assert stand == ["drawn.json", "of_readme.json", "rates.json", "readme.json", "trackers.json"]
