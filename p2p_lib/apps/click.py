@@ -175,6 +175,23 @@ def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config 
     return found
 
 
+def corrected_masks(
+    sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None
+) -> list[tuple[str, Frame, np.ndarray]]:
+    """Of each later prompt of an object its name, frame and mask: cut out anew there, as a run does it."""
+    config, started = config or preset(), set[str]()
+    found = list[tuple[str, Frame, np.ndarray]]()
+    for i, of_frame in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
+        again = started & {prompt.name for prompt in of_frame}
+        started |= {prompt.name for prompt in of_frame}
+        if again:
+            frame = sequence.frame(i)
+            segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
+            labels = segmenter.segment(frame, of_frame)
+            found += [(name, frame, labels == k) for k, name in enumerate(segmenter.names, 1) if name in again]
+    return found
+
+
 def check_writable(path: Path) -> None:
     """Refuse a file that could not be written in the end, before anyone works for it."""
     folder = next(p for p in path.absolute().parents if p.exists())

@@ -312,6 +312,33 @@ def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
     assert "Click again" in wrong.fix and not len(recwarn)
 
 
+def test_a_correction_is_looked_at_as_a_first_prompt_is(good):
+    """What is doubted of its clicks is said, and where what they select is longer than the object."""
+    (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
+    (again,) = (replace(p, frame=4) for p in prompts_in({"box": open_sequence(good).masks(4)["box"]}))
+    assert alarms(check_folder(good, prompts=[box, again])) == []
+
+    def looked(*points):
+        wrong = replace(again, points_px=np.array(points, float))
+        return [f for f in alarms(check_folder(good, prompts=[wrong, box])) if f.name.startswith("box: ")]
+
+    plane, length = looked([60, 240])
+    assert "clicks on 'box' in frame 4" in plane.text and "like a table or a wall" in plane.text
+    assert re.match(r"clicks in frame 4 select \d+ cm, \d\.\d times as long as in frame 0", length.text)
+    assert length.level is Level.LOOK and length.fix.startswith("Put a box around it")
+    (nothing,) = looked([5, 5])
+    assert "clicks on 'box' in frame 4: no object was found there" in nothing.text
+
+
+def test_a_later_object_of_nearly_the_same_name_may_be_a_correction(good):
+    (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
+    masks = open_sequence(good).masks(4)
+    later = [replace(p, frame=4) for p in prompts_in({"bx": masks["box"], "lid": masks["can"]})]
+    findings = alarms(check_folder(good, prompts=[box, *later]))
+    (name,) = (f for f in findings if f.name.endswith("name"))
+    assert (name.name, name.text, name.fix) == ("bx: name", "a new object from frame 4 on", "Did you mean box?")
+
+
 def scaled_depth(folder, factor):
     for path in (folder / "depth").iterdir():
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * float(factor)
