@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.errors import Doubt, Doubts
+from p2p_lib.core.errors import Doubt, Doubts, doubt
 from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
@@ -24,6 +24,7 @@ from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.suspicions import GROWN
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.extended.saving import keep_memory
 
@@ -59,11 +60,11 @@ class Keeper:
 
     @cached_property
     def first_masks(self) -> FirstMasks:
-        """The picture of what the objects were started with."""
+        """The picture of what the objects were started with, and of what corrections made."""
         return FirstMasks(self.writer.path / FIRST_MASKS, self.prompts)
 
-    def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> list[str]:
-        """The frame that has just been estimated; which objects have their first mask in it."""
+    def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> tuple[list[str], list[str]]:
+        """The frame that has just been estimated; of which objects the first mask in it is drawn, a corrected one."""
         method = self.method
         for name, obj in method.objects.items():
             if obj not in (trackers := self.followed.setdefault(name, [])):
@@ -77,7 +78,14 @@ class Keeper:
         for name, mask in method.masks.items():
             if mask is not None:
                 self.mask_log.add(frame, name, mask)
-        return self.first_masks.add(frame, method.masks)
+        new, corrected = self.first_masks.add(frame, method.masks)
+        for name in corrected:
+            length_m, factor = self.mask_log.growth(name)
+            if factor > GROWN:
+                got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"
+                fix = "If it holds more than the object: negative clicks on what is not it, a box, or a painted mask."
+                doubt(f"correction of {name!r} in frame {frame.index}", got, fix)
+        return new, corrected
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""

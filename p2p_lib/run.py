@@ -16,7 +16,7 @@ import numpy as np
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import Config
 from p2p_lib.core.depth import in_range
-from p2p_lib.core.errors import BadInput, Doubts, MissingData, P2PError, advised, doubt
+from p2p_lib.core.errors import BadInput, Doubts, MissingData, P2PError, advised, did_you_mean, doubt
 from p2p_lib.core.memory import ObjectMemory, far_fewer_pixels, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar, waiting_for
@@ -297,7 +297,7 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ..
     chosen = tuple(known if wanted is None else wanted)
     for name in chosen:
         if name not in known:
-            raise BadInput("objects", repr(name), "some of " + ", ".join(known))
+            raise BadInput("objects", repr(name), "some of " + ", ".join(known), did_you_mean(name, known))
     if not chosen:
         raise BadInput("objects", "none", "masks or prompts that show at least one", "Add masks/ or give --prompts.")
     return chosen
@@ -369,9 +369,10 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
 
         try:
             for frame, estimates in _estimates(method, job, leave_out if skip_bad else None):
-                if (started := keeper.add(frame, estimates)) and progress:
-                    bar.clear()
-                    say(f"First masks of {', '.join(started)} in frame {frame.index}: {keeper.first_masks.path}")
+                for what, drawn in zip(("First", "Corrected"), keeper.add(frame, estimates), strict=True):
+                    if drawn and progress:
+                        bar.clear()
+                        say(f"{what} masks of {', '.join(drawn)} in frame {frame.index}: {keeper.first_masks.path}")
                 unseen -= _doubt_range(job, frame, {n: mask for n, mask in method.masks.items() if n in unseen})
                 now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
                 bar.set_postfix_str(now, refresh=False)

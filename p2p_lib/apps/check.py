@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from p2p_lib.apps.click import FirstMasks, clicked_masks, corrected_masks
+from p2p_lib.apps.click import FirstMasks, check_depths, clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
@@ -34,7 +34,6 @@ from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.evaluation.known_size import size_doubt
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
-from p2p_lib.evaluation.suspicions import GROWN
 from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
@@ -112,9 +111,9 @@ def check_folder(
         warnings.simplefilter("always", Doubt)
         try:
             firsts = clicked_masks(sequence, prompts, config) if prompts else _first_masks(sequence, config)
-            later = corrected_masks(sequence, prompts, config)
+            check_depths(sequence, prompts)
         except P2PError as error:
-            firsts, later = {}, []
+            firsts = {}
             wrong.append(_unreadable("clicks" if prompts else "masks", error))
     sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects)
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
@@ -141,7 +140,7 @@ def check_folder(
         warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
         findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in warned]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
-        findings += _corrected(name, firsts, later, sequence.camera)
+        findings += _misspelt(name, firsts)
     return findings
 
 
@@ -349,21 +348,12 @@ def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) ->
     return Finding(f"{name}: mask", Level.WRONG, text, "Click again, near the centre of the object: p2p click.")
 
 
-def _corrected(
-    name: str, firsts: FirstMasks, later: list[tuple[str, Frame, np.ndarray]], camera: Camera
-) -> list[Finding]:
-    """Of later prompts of an object, beside what is doubted of them: one of its length? Or is it a misspelt one?"""
-    (first, mask), found = firsts[name], list[Finding]()
+def _misspelt(name: str, firsts: FirstMasks) -> list[Finding]:
+    """Whether an object that comes later is an earlier one, to be corrected, whose name was misspelt."""
+    first, _ = firsts[name]
     if meant := did_you_mean(name, [n for n, (frame, _) in firsts.items() if frame.index < first.index]):
-        found.append(Finding(f"{name}: name", Level.LOOK, f"a new object from frame {first.index} on", meant))
-    length_m = mask_length_m(first, mask, camera)
-    fix = "Put a box around it, or negative clicks on what is not it, or paint the mask: p2p click."
-    for of, frame, corrected in later:
-        now_m = mask_length_m(frame, corrected, camera) if of == name else 0.0
-        if now_m > GROWN * length_m:
-            text = f"clicks in frame {frame.index} select {100 * now_m:.0f} cm, {now_m / length_m:.1f} times as long as"
-            found.append(Finding(f"{name}: clicks", Level.LOOK, f"{text} in frame {first.index}", fix))
-    return found
+        return [Finding(f"{name}: name", Level.LOOK, f"a new object from frame {first.index} on", meant)]
+    return []
 
 
 def _beyond(firsts: FirstMasks, config: Config, scale: float) -> Finding | None:

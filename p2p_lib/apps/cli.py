@@ -280,8 +280,10 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
         warn("p2p eval: --models is not used, because the run has no truth.")
     for name, text in size_doubts(a.run, known_m).items() if score else ():
         warn(f"p2p eval: {name}: {text}")
-    shown = score or replace(consistency(run, known_m=known_m), not_scored=not_scored)
-    _show(shown, a.json, offline=bool(run.info.get("offline")))
+    scored = () if score is None else [name for name, obj in run.objects.items() if obj.has_truth.any()]
+    others = {name: obj for name, obj in run.objects.items() if name not in scored}
+    judged = replace(consistency(replace(run, objects=others), known_m=known_m), not_scored=not_scored)
+    _show(score or judged, a.json, bool(run.info.get("offline")), judged if score and others else None)
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
@@ -546,11 +548,14 @@ def _film_wanted(path: Path | None) -> Callable[..., Path] | None:
     return write_film
 
 
-def _show(score: Any, as_json: bool, offline: bool = False) -> None:
+def _show(score: Any, as_json: bool, offline: bool = False, others: Any = None) -> None:
+    """A score, and what is said of the ``others``, objects that it is not of."""
+    both = [score] if others is None else [score, others]
     if as_json:
-        print(json.dumps(score.as_dict() | ({"offline": True} if offline else {})))
+        more = {} if others is None else {"others": others.as_dict()}
+        print(json.dumps(score.as_dict() | more | ({"offline": True} if offline else {})))
     else:
-        print("\n".join([score.as_table(), *[NOT_CAUSAL] * offline]))
+        print("\n".join([*(of.as_table() for of in both), *[NOT_CAUSAL] * offline]))
 
 
 from p2p_lib.apps import data_commands  # noqa: E402, F401 - declared, and listed by --help, after those above

@@ -11,7 +11,7 @@ import os
 import re
 import secrets
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from http import HTTPStatus
@@ -109,21 +109,29 @@ class Clicker(AbstractContextManager):
     def masks(self, content: object) -> dict[str, Any]:
         """What the prompts of a frame, as the page sends them, make of it, and what is doubtful about them.
 
-        ``masks`` are run lengths of each object that its prompts can start, or of which the run kept a mask.
+        ``masks`` are run lengths of each object that its prompts can start, or of which the run kept a mask, which they
+        correct.
         """
         given = content if isinstance(content, dict) else {}
         frame, prompts = given.get("frame"), parse_prompts(given) if given.get("objects") else ()
         if not isinstance(frame, int) or not 0 <= frame < len(self.sequence):
             raise BadInput("frame", repr(frame), f"a number from 0 to {len(self.sequence) - 1}")
-        made, doubts = self.made(prompts)
-        found = self.kept_masks(frame) | made
+        kept = self.kept_masks(frame)
+        made, doubts = self.made(prompts, kept)
+        found = kept | made
         return {"masks": {name: run_lengths(mask)["counts"] for name, mask in found.items()}, "doubts": doubts}
 
-    def made(self, prompts: Iterable[Prompt]) -> tuple[dict[str, np.ndarray], list[str]]:
-        """The mask (H, W) bool of each object that its prompts can start, and what is doubtful about them."""
+    def made(
+        self, prompts: Iterable[Prompt], kept: Mapping[str, np.ndarray]
+    ) -> tuple[dict[str, np.ndarray], list[str]]:
+        """The mask (H, W) bool of each object that its prompts can start, or whose ``kept`` mask (H, W) they correct.
+
+        And what is doubtful about them.
+        """
+        was = {name: mask for name, mask in kept.items() if mask.any()}
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
-            made = clicked_masks(self.sequence, [prompt for prompt in prompts if prompt.starts])
+            made = clicked_masks(self.sequence, [p for p in prompts if p.starts or p.name in was], was=was)
         texts = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
         return {name: mask for name, (_, mask) in made.items()}, texts
 
@@ -131,9 +139,7 @@ class Clicker(AbstractContextManager):
         """The prompts that the page sends; objects that are ``started`` may be corrected alone."""
         prompts = parse_prompts(content)
         by_frame = prompts_by_frame(prompts, range(len(self.sequence)), self.sequence.camera, started)
-        for i, of_frame in by_frame.items():
-            for prompt in of_frame:
-                check_depth(prompt, self.sequence.frame(i))
+        check_depths(self.sequence, [prompt for of_frame in by_frame.values() for prompt in of_frame])
         return prompts
 
     def save(self, content: object) -> str:
@@ -163,33 +169,32 @@ def first_change(before: Iterable[Prompt], after: Iterable[Prompt]) -> int | Non
     return min((frame for frame, _ in one ^ other), default=None)
 
 
-def clicked_masks(sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None) -> FirstMasks:
-    """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of."""
-    config = config or preset()
+def clicked_masks(
+    sequence: Sequence,
+    prompts: Iterable[Prompt],
+    config: Config | None = None,
+    was: Mapping[str, np.ndarray] | None = None,
+) -> FirstMasks:
+    """Each object's first mask, as the built-in segmenter cuts it out of the frame that its first prompt is of.
+
+    was  objects' masks (H, W) bool in that frame, which the prompts correct
+    """
+    config, was = config or preset(), was or {}
     found: FirstMasks = {}
-    for i, of_frame in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
+    for i, of_frame in prompts_by_frame(prompts, range(len(sequence)), sequence.camera, was).items():
         frame = sequence.frame(i)
         segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
+        if known := [Prompt(p.name, i, mask=was[p.name]) for p in of_frame if p.name in was and p.mask is None]:
+            segmenter.segment(frame, known)
         labels = segmenter.segment(frame, [prompt for prompt in of_frame if prompt.name not in found])
         found |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
     return found
 
 
-def corrected_masks(
-    sequence: Sequence, prompts: Iterable[Prompt], config: Config | None = None
-) -> list[tuple[str, Frame, np.ndarray]]:
-    """Of each later prompt of an object its name, frame and mask: cut out anew there, as a run does it."""
-    config, started = config or preset(), set[str]()
-    found = list[tuple[str, Frame, np.ndarray]]()
-    for i, of_frame in prompts_by_frame(prompts, range(len(sequence)), sequence.camera).items():
-        again = started & {prompt.name for prompt in of_frame}
-        started |= {prompt.name for prompt in of_frame}
-        if again:
-            frame = sequence.frame(i)
-            segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
-            labels = segmenter.segment(frame, of_frame)
-            found += [(name, frame, labels == k) for k, name in enumerate(segmenter.names, 1) if name in again]
-    return found
+def check_depths(sequence: Sequence, prompts: Iterable[Prompt]) -> None:
+    """Refuse clicks and boxes without depth: a run would end there."""
+    for prompt in prompts:
+        check_depth(prompt, sequence.frame(prompt.frame))
 
 
 def check_writable(path: Path) -> None:

@@ -90,7 +90,7 @@ class LiveClicker(Clicker):
         prompts, then, now = self.checked(content, self._names), self._shown, self._newest[0]
         if then is None or now is None:
             return ""  # checked above
-        made, _ = self.made([prompt for prompt in prompts if prompt.mask is None])
+        made, _ = self.made([prompt for prompt in prompts if prompt.mask is None], self._masks)
         said: list[dict[str, Any]] = []
         moved: list[dict[str, Any]] = []
         for prompt, entry in zip(prompts, content["objects"]):  # type: ignore[index]  # it has been parsed

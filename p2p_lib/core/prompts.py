@@ -74,7 +74,7 @@ def check_prompt(prompt: Prompt, camera: Camera) -> None:
     for what, at in (("clicks on", prompt.points_px), ("negative clicks of", prompt.negative_px)):
         outside = ~camera.inside(at, -0.5)
         if outside.any():
-            raise BadInput(f"{what} {name!r}", _pixel(at[outside][0]), f"pixels within {size}")
+            raise BadInput(f"{what} {name!r} in frame {prompt.frame}", _pixel(at[outside][0]), f"pixels within {size}")
     if prompt.box_px is not None:
         left, top, right, bottom = prompt.box_px
         if right < 0 or bottom < 0 or left > camera.width - 1 or top > camera.height - 1:

@@ -1,4 +1,4 @@
-"""``first_masks.png`` of a run: what the objects were started with, drawn as soon as it is there.
+"""``first_masks.png`` of a run: what prompts made, the objects' first masks and corrected ones, drawn at that moment.
 
 The frame with every object's outline, clicks and box, and below it each object by itself, with its name and pixels:
 whoever sees that a mask is not the object stops there and clicks again.
@@ -24,38 +24,46 @@ _FONT, _WHITE = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
 _CLOSE_PX, _ACROSS, _ROOM = 240, 4, 0.3
 #: The outline of a larger object is thicker.
 _LARGE_PX = 10_000
+#: Frames with corrections that are shown, the newest ones.
+_CORRECTIONS = 12
 
 
 class FirstMasks:
-    """Collects each object's first mask with any pixels and draws them, frame below frame.
+    """Collects each object's first mask with any pixels, and those that prompts correct; draws them frame below frame.
 
     prompts  what is said of objects; it may grow meanwhile. Those newest in a mask's frame are drawn with it
     """
 
     def __init__(self, path: Path, prompts: Iterable[Prompt] = ()):
         self.path, self._prompts, self._followed = path, prompts, set[str]()
-        self._started, self._panels = list[str](), list[np.ndarray]()
+        self._started, self._panels, self._corrected = list[str](), list[np.ndarray](), list[np.ndarray]()
 
-    def add(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> list[str]:
-        """The masks that served in a frame; which objects are new, whose picture is written then."""
+    def add(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> tuple[list[str], list[str]]:
+        """The masks that served in a frame; which objects are new in it, and which were corrected: both are drawn."""
         self._followed &= masks.keys()  # what was removed may be added again
-        new = {name: mask for name, mask in masks.items() if name not in self._followed and mask is not None}
-        new = {name: mask for name, mask in new.items() if mask.any()}
-        if new:
-            self._followed |= new.keys()
-            self._started = list(dict.fromkeys([*self._started, *new]))
-            colours = object_colours(self._started)
-            said = sorted((p for p in self._prompts if p.frame <= frame.index), key=lambda p: p.frame)
-            prompts = [prompt for name, prompt in {p.name: p for p in said}.items() if name in new]
-            self._panels.append(_panel(frame, new, prompts, colours))
-            width = max(panel.shape[1] for panel in self._panels)
-            sheet = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0))) for p in self._panels]
-            save_png(self.path, np.concatenate(sheet))
-        return list(new)
+        seen = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
+        said = sorted((p for p in self._prompts if p.frame <= frame.index), key=lambda p: p.frame)
+        newest = {prompt.name: prompt for prompt in said}
+        new = {name: mask for name, mask in seen.items() if name not in self._followed}
+        again = {name: mask for name, mask in seen.items() if name in newest and newest[name].frame == frame.index}
+        again = {name: mask for name, mask in again.items() if name in self._followed}
+        self._followed |= new.keys()
+        self._started = list(dict.fromkeys([*self._started, *new]))
+        for title, drawn, panels in (("first", new, self._panels), ("corrected", again, self._corrected)):
+            if drawn:
+                prompts = [newest[name] for name in drawn if name in newest]
+                title = f"{title} masks, frame {frame.index}"
+                panels.append(_panel(frame, drawn, prompts, object_colours(self._started), title))
+        del self._corrected[:-_CORRECTIONS]
+        if new or again:
+            sheet = [*self._panels, *self._corrected]
+            width = max(panel.shape[1] for panel in sheet)
+            save_png(self.path, np.concatenate([np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0))) for p in sheet]))
+        return list(new), list(again)
 
 
 def _panel(
-    frame: Frame, masks: Mapping[str, np.ndarray], prompts: Iterable[Prompt], colours: Mapping[str, str]
+    frame: Frame, masks: Mapping[str, np.ndarray], prompts: Iterable[Prompt], colours: Mapping[str, str], title: str
 ) -> np.ndarray:
     """A frame with outlines and prompts, and below it each object by itself."""
     image = frame.rgb.copy()
@@ -68,7 +76,7 @@ def _panel(
     height_px = max(_CLOSE_PX, *side_px.values())  # none is smaller than in the frame
     parts = [_close(image, masks[name], name, prompts, colours[name], side_px[name], height_px) for name in masks]
     _draw_prompts(image, prompts, colours, 1.0, np.zeros(2))
-    _write(image, f"first masks, frame {frame.index}")
+    _write(image, title)
     blank = [np.zeros_like(parts[0])] * (-len(parts) % _ACROSS if len(parts) > _ACROSS else 0)
     parts = [*parts, *blank]
     rows = [np.concatenate(parts[k : k + _ACROSS], 1) for k in range(0, len(parts), _ACROSS)]

@@ -96,6 +96,12 @@ class MaskLog:
         box = (*low.tolist(), *(high - low).tolist())
         self._rows[name].append(_Row(frame.index, int(np.count_nonzero(mask)), box, bits, *_measured(p_cam)))
 
+    def growth(self, name: str) -> tuple[float, float]:
+        """The length of an object's newest mask, m, and over the median of those before; NaN: not measured."""
+        *before, newest = [row.size_m for row in self._rows[name]]
+        known = np.array(before)[np.isfinite(before)]
+        return newest, newest / float(np.median(known)) if len(known) else float("nan")
+
     def save(self, folder: Path) -> None:
         """Write the file."""
         arrays = {}

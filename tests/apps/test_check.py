@@ -312,22 +312,16 @@ def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
     assert "Click again" in wrong.fix and not len(recwarn)
 
 
-def test_a_correction_is_looked_at_as_a_first_prompt_is(good):
-    """What is doubted of its clicks is said, and where what they select is longer than the object."""
+def test_a_correction_without_depth_is_said_before_a_run_ends_there(good, tmp_path):
+    good = shutil.copytree(good, tmp_path / "hole")
     (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
     (again,) = (replace(p, frame=4) for p in prompts_in({"box": open_sequence(good).masks(4)["box"]}))
     assert alarms(check_folder(good, prompts=[box, again])) == []
-
-    def looked(*points):
-        wrong = replace(again, points_px=np.array(points, float))
-        return [f for f in alarms(check_folder(good, prompts=[wrong, box])) if f.name.startswith("box: ")]
-
-    plane, length = looked([60, 240])
-    assert "clicks on 'box' in frame 4" in plane.text and "like a table or a wall" in plane.text
-    assert re.match(r"clicks in frame 4 select \d+ cm, \d\.\d times as long as in frame 0", length.text)
-    assert length.level is Level.LOOK and length.fix.startswith("Put a box around it")
-    (nothing,) = looked([5, 5])
-    assert "clicks on 'box' in frame 4: no object was found there" in nothing.text
+    path = sorted((good / "depth").iterdir())[4]
+    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), 0 * depth)
+    wrong = [f for f in alarms(check_folder(good, prompts=[again, box])) if f.name == "clicks"]
+    assert len(wrong) == 1 and "has no depth in frame 4" in wrong[0].text
 
 
 def test_a_later_object_of_nearly_the_same_name_may_be_a_correction(good):

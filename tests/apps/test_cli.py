@@ -373,6 +373,23 @@ def test_with_truth_and_no_model_both_are_said(sequence, tmp_path, capsys):
     assert "DIR and --sequence do not go together: --poses" in capsys.readouterr().err
 
 
+def test_objects_without_truth_are_judged_beside_those_that_are_scored(sequence, tmp_path, capsys):
+    masks = open_sequence(sequence).masks(0)
+    other = np.roll(next(iter(masks.values())), 20, 1)
+    prompts = tmp_path / "prompts.json"
+    save_prompts(prompts, [Prompt("object", 0, mask=masks["object"] & ~other), Prompt("other", 0, mask=other)])
+    assert run(sequence, tmp_path / "out", "--prompts", str(prompts)) == 0
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "out")]) == 0
+    scored, judged = capsys.readouterr().out.split("Without truth: ")
+    assert "ADD AUC" in scored and re.search("^object ", scored, re.M) and not re.search("^other ", scored, re.M)
+    assert re.search("^other ", judged, re.M) and len(re.findall("^object ", judged, re.M)) == 1, "a heading"
+    assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["objects"].keys() == {"object"} and said["others"]["objects"].keys() == {"other"}
+    assert said["others"]["objects"]["other"]["verdict"] in ("good", "look", "unknown")
+
+
 def test_models_that_cannot_be_used_are_said(sequence, tmp_path, capsys):
     shutil.rmtree(sequence / "annotated_poses")
     mesh = tmp_path / "mesh.obj"

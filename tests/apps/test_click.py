@@ -114,7 +114,10 @@ def test_what_the_file_holds_is_shown_first(sequence, out):
 
 
 REFUSED = {
-    "outside": ({"objects": [one(points=[(W, 5)])]}, "clicks on 'cup': got (80, 5), expected pixels within 80x60"),
+    "outside": (
+        {"objects": [one(points=[(W, 5)])]},
+        "clicks on 'cup' in frame 0: got (80, 5), expected pixels within 80x60",
+    ),
     "no depth": ({"objects": [one(points=[(5, 5)])]}, "(5, 5) has no depth in frame 0"),
     "same click": ({"objects": [one(), one("bowl")]}, "clicks on 'bowl': got a click that is also one of 'cup'"),
     "same name": ({"objects": [one(), one()]}, "'cup' in frame 0 twice"),

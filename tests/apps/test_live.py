@@ -632,7 +632,7 @@ def test_clicks_that_select_nothing_are_refused_on_the_page(folder, monkeypatch)
         page.see(open_sequence(folder).frame(0), {})
         page.session()
         nothing = {"board": np.zeros((H, W), bool)}
-        monkeypatch.setattr(page, "made", lambda prompts: (nothing, []))
+        monkeypatch.setattr(page, "made", lambda prompts, kept: (nothing, []))
         with pytest.raises(BadInput, match="nothing found there"):
             page.save({"objects": [{"name": "board", "frame": 0, "points": [[64, 52]]}]})
 

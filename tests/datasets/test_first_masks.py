@@ -29,15 +29,15 @@ def read(path) -> np.ndarray:
 def test_each_object_is_drawn_in_the_frame_that_it_starts_in(tmp_path):
     path = tmp_path / "first.png"
     firsts = FirstMasks(path, [Prompt("cup", 0, [[65, 65]], negative_px=[[20, 100]]), Prompt("box", 3, [[10, 40]])])
-    assert firsts.add(picture(0), {"cup": None, "box": np.zeros((H, W), bool)}) == [] and not path.exists()
-    assert firsts.add(picture(1), {"cup": square(50, 50), "box": None}) == ["cup"]
+    assert firsts.add(picture(0), {"cup": None, "box": np.zeros((H, W), bool)}) == ([], []) and not path.exists()
+    assert firsts.add(picture(1), {"cup": square(50, 50), "box": None}) == (["cup"], [])
     image, cup, box = read(path), np.array(rgb(OBJECTS[0])), np.array(rgb(OBJECTS[1]))
     assert (image[50, 50:80] == cup).all() and (image[50:80, 79] == cup).all(), "the outline, where the mask is"
     assert (image[65, 65] == cup).all() and (image[100, 20] == cup).all(), "clicks on it and beside it"
     assert (image[55:60, 55:60] == GRAY).all() and (image[30:48, 40:120] == GRAY).all(), "and nothing elsewhere"
     before = path.read_bytes()
-    assert firsts.add(picture(2), {"cup": square(10, 10), "box": None}) == [] and path.read_bytes() == before
-    assert firsts.add(picture(3), {"cup": square(10, 10), "box": square(30, 0)}) == ["box"]
+    assert firsts.add(picture(2), {"cup": square(10, 10), "box": None}) == ([], []) and path.read_bytes() == before
+    assert firsts.add(picture(3), {"cup": square(10, 10), "box": square(30, 0)}) == (["box"], [])
     both = read(path)
     np.testing.assert_array_equal(both[: len(image), : image.shape[1]], image)
     assert (both[len(image) + 30, 0:30] == box).all(), "at the image's edge"
@@ -48,11 +48,11 @@ def test_what_was_said_meanwhile_is_drawn_and_an_object_that_was_added_again(tmp
     path, cup, said = tmp_path / "first.png", np.array(rgb(OBJECTS[0])), [Prompt("cup", 9, [[10, 100]])]
     firsts = FirstMasks(path, said)
     said += [Prompt("cup", 0, [[20, 40]]), Prompt("cup", 1, [[65, 65]])]
-    assert firsts.add(picture(2), {"cup": square(50, 50)}) == ["cup"]
+    assert firsts.add(picture(2), {"cup": square(50, 50)}) == (["cup"], [])
     image = read(path)
     assert (image[65, 65] == cup).all() and (image[30:48, 10:48] == GRAY).all()
-    assert firsts.add(picture(3), {"cup": None}) == firsts.add(picture(4), {"cup": square(9, 9)}) == []
-    assert firsts.add(picture(5), {}) == [] and firsts.add(picture(9), {"cup": square(0, 50)}) == ["cup"]
+    assert firsts.add(picture(3), {"cup": None}) == firsts.add(picture(4), {"cup": square(9, 9)}) == ([], [])
+    assert firsts.add(picture(5), {}) == ([], []) and firsts.add(picture(9), {"cup": square(0, 50)}) == (["cup"], [])
     again = read(path)[len(image) :]
     assert (again[100, 10] == cup).all() and (again[65, 65] == GRAY).all() and (again[29, 50:80] == cup).all()
 
@@ -69,6 +69,25 @@ def test_no_object_is_smaller_by_itself_than_in_the_frame(tmp_path):
 
 def test_eight_objects_fit(tmp_path):
     masks = {f"a long name of object {k}": square(10 + 50 * (k // 4), 5 + 35 * (k % 4), 20) for k in range(8)}
-    assert len(FirstMasks(tmp_path / "first.png").add(picture(0), masks)) == 8
+    assert len(FirstMasks(tmp_path / "first.png").add(picture(0), masks)[0]) == 8
     image = read(tmp_path / "first.png")
     assert image.shape == (H + 2 * 240, 4 * 240, 3)
+
+
+def test_corrections_are_drawn_below_the_newest_ones_of_many(tmp_path):
+    """Frame by frame, under what the objects started with; of an object that is hidden there is nothing to draw."""
+    path, cup = tmp_path / "first.png", np.array(rgb(OBJECTS[0]))
+    said = [Prompt("cup", 0, [[65, 65]]), *(Prompt("cup", k, [[75, 75]]) for k in range(3, 60))]
+    firsts = FirstMasks(path, said)
+    assert firsts.add(picture(0), {"cup": square(50, 50)}) == (["cup"], [])
+    image = read(path)
+    assert firsts.add(picture(2), {"cup": square(50, 50)}) == firsts.add(picture(3), {"cup": None}) == ([], [])
+    assert firsts.add(picture(4), {"cup": square(40, 60)}) == ([], ["cup"])
+    both = read(path)
+    np.testing.assert_array_equal(both[: len(image)], image)
+    assert (both[len(image) + 40, 60:90] == cup).all() and len(both) == 2 * len(image)
+    for k in range(5, 60):
+        assert firsts.add(picture(k), {"cup": square(k, 60)}) == ([], ["cup"])
+    many = read(path)
+    np.testing.assert_array_equal(many[: len(image)], image)
+    assert len(many) == 13 * len(image) and (many[12 * len(image) + 59, 60:90] == cup).all()

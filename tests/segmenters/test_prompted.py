@@ -16,7 +16,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.patch import Box, Patch
 from p2p_lib.segmenters.builtin.prompted import Cut, Cutter
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
-from p2p_lib.segmenters.builtin.start_doubts import doubt_start
+from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
 
@@ -144,7 +144,7 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
     prompt = Prompt("left", points_px=[[110, 100]])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        doubt_start(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others)
+        doubt_prompt(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others, True)
     assert bool(caught) == said
     if said:
         text = r"3600 pixels selected; a mask of 6600 fits as well. If pixel \((\d+), (\d+)\)"
@@ -168,7 +168,7 @@ def test_a_click_on_another_thing_is_named(clicks, named):
     cutter = Cutter(frame, CAMERA, preset().segmentation, Prompt("left", points_px=clicks), np.zeros((0, 2)))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        doubt_start(cutter, LEFT | RIGHT if named else LEFT, {})
+        doubt_prompt(cutter, LEFT | RIGHT if named else LEFT, {}, True)
     said = [re.search(r"alone, the click at \((\d+), (\d+)\) selects something else", str(w.message)) for w in caught]
     assert [tuple(map(int, found.groups())) for found in said if found] == ([named] if named else [])
 
@@ -252,6 +252,38 @@ def test_a_correction_mends_the_mask_and_lasts(was, say):
     found = follow.segment(picture(1), [Prompt("left", 1, **say)]) == 1
     assert iou(found, LEFT) > 0.85 > iou(was, LEFT)
     assert iou(follow.segment(picture(2)) == 1, LEFT) > 0.8
+
+
+WALL = rectangle(20, 20, 60, 50)  # part of it
+
+
+@pytest.mark.parametrize(
+    ("was", "say", "left", "right", "wall"),
+    [
+        (LEFT | WALL, {"points_px": [[110, 100]], "negative_px": [[175, 110]]}, 1, 0, 1),
+        (LEFT | RIGHT | WALL, {"negative_px": [[40, 35]]}, 1, 1, 0),
+        (WALL | LEFT & rectangle(90, 80, 120, 140), {"points_px": [[140, 120]]}, 1, 0, 1),
+        (WALL, {"points_px": [[120, 110]], "negative_px": [[175, 110]]}, 1, 0, 0),
+    ],
+    ids=["clicks that agree", "one beside it", "one on what is missing", "all clicks far from it"],
+)
+def test_what_no_click_contradicts_stays(was, say, left, right, wall):
+    """Part of the wall counts as the object until a click says that it does not, or none is near the mask."""
+    frame, follow = picture(), segmenter()
+    follow.segment(frame, [Prompt("left", mask=was)])
+    found = follow.segment(frame, [Prompt("left", **say)]) == 1
+    for part, share in ((LEFT, left), (RIGHT, right), (WALL, wall)):
+        assert found[part].mean() == pytest.approx(share, abs=0.1)
+
+
+def test_a_mask_is_corrected_in_the_image_that_it_is_of():
+    """As the page shows what a click makes of a run's mask: nothing is followed from an image to itself."""
+    odd = LEFT & ~rectangle(100, 90, 110, 100) | rectangle(60, 100, 90, 110)
+    frame, follow = picture(0), segmenter()
+    follow.segment(frame, [Prompt("left", mask=odd)])
+    np.testing.assert_array_equal(follow.segment(frame, [Prompt("left", points_px=[[130, 120]])]) == 1, odd)
+    mended = follow.segment(frame, [Prompt("left", negative_px=[[70, 105]])]) == 1
+    assert not mended[100:110, 60:86].any() and iou(mended, odd & LEFT) > 0.95
 
 
 def test_a_click_brings_back_what_was_given_up():

@@ -161,24 +161,26 @@ class Patch:
         return ends * self.cell_px + [self.box.left, self.box.top]
 
     def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
-        """(h, w) bool: the cells that are nearer to ``one`` (h, w) bool than to ``other``, by paths along like cells.
+        """(h, w) bool: the cells that are nearer to ``one`` (h, w) bool than to ``other``, see :meth:`away`."""
+        return self.away(one, like) < self.away(other, like)
+
+    def away(self, region: np.ndarray, like: float) -> np.ndarray:
+        """(h, w) lengths of paths along like cells to a region (h, w) bool; infinite where it is empty.
 
         like  length of a step between cells that are alike; one across the strongest edge is longer by 1
         """
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
+        if not region.any():
+            return np.full(self.shape, np.inf)
         number = np.arange(self.depth_m.size).reshape(self.shape)
         right, below = self.edge_weights
         ends = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
         starts = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
         length = like + 1 - np.concatenate([right.ravel(), below.ravel()])
         grid = coo_array((length, (starts, ends)), shape=(number.size,) * 2).tocsr()
-        to_one, to_other = (
-            dijkstra(grid, directed=False, indices=number[of], min_only=True) if of.any() else np.inf
-            for of in (one, other)
-        )
-        return np.broadcast_to(to_one < to_other, number.size).reshape(self.shape)
+        return dijkstra(grid, directed=False, indices=number[region], min_only=True).reshape(self.shape)
 
     def border(self) -> np.ndarray:
         """(h, w) bool: the outermost pixels."""

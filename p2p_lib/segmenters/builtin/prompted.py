@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
+from p2p_lib.core.image import bounds
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.cut import cut
@@ -22,6 +22,8 @@ from p2p_lib.segmenters.builtin.patch import (
     Box,
     Patch,
     around,
+    components_touching,
+    connected_components,
     keep_seeded_components,
 )
 from p2p_lib.segmenters.builtin.start_evidence import (
@@ -37,8 +39,10 @@ from p2p_lib.segmenters.builtin.start_evidence import (
 
 #: Room around an object on top of ``config.margin``, which is too little for small ones, px.
 ROOM_PX = 6
-#: About so many pixels of a mask's middle count as clicks on the object when it is corrected.
-_MIDDLE = 40
+#: Log-odds of a mask that is corrected, where no click makes it doubtful.
+_KEPT = 4.0
+#: Weight of what depth connects with a click on something that the mask lacks: less than where clicks are all there is.
+_REACHED = 0.5
 NO_PX = np.zeros((0, 2))
 #: A box may be drawn too tight by this share of its size.
 _TIGHT = 0.05
@@ -137,23 +141,56 @@ class Cutter:
         inside = mask[others].mean() if others.any() else 0.0
         return Cut(float(patch.outline_tie(mask) + inside) / _SCALES[scale], patch.box, patch.up(x))
 
-    def correct(self, was: np.ndarray, known_px: np.ndarray) -> tuple[Box, np.ndarray]:
-        """Cut anew, from the clicks that correct a mask (H, W) bool, and from what is right about the mask.
+    def correct(self, was: np.ndarray) -> tuple[Box, np.ndarray]:
+        """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays.
 
-        known_px  (K, 2) pixels that are probably on the object, as is the mask's middle. Of both are used those nearer
-                  to a positive click than to a negative one; with negative clicks alone, the third that is
-                  farthest from them
+        Farther from every positive click than it is long, the mask is of something else: the clicks alone count then.
         """
-        inner = cv2.distanceTransform(np.pad(was, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-        v, u = np.nonzero(inner >= inner.max() / 2)
-        right_px = np.concatenate([known_px, np.stack([u, v], -1)[:: max(1, len(u) // _MIDDLE)]])
-        positive, negative = (
-            np.linalg.norm(right_px[:, None] - at, axis=-1).min(1, initial=np.inf)
-            for at in (self.prompt.points_px, self.prompt.negative_px)
-        )
-        right_px = right_px[negative >= (positive if np.isfinite(positive).all() else np.quantile(negative, 2 / 3))]
-        points_px = np.concatenate([self.prompt.points_px, right_px])
-        return replace(self, prompt=replace(self.prompt, points_px=points_px)).start()
+        clicks, (rows, columns) = self.prompt.points_px, bounds(was)
+        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+        away = np.maximum(np.maximum(ends[0] - clicks, clicks - ends[1] + 1), 0)
+        if len(clicks) and np.linalg.norm(away, axis=1).min() > np.ptp(ends, 0).max():
+            return self.start()
+        px = np.concatenate([ends, clicks, self.prompt.negative_px])
+        fits = replace(self.config, side_px=2 * self.config.side_px)
+        patch = Patch.of(self.frame, self._room(px.min(0), px.max(0)), self.camera, fits)
+        on, seeds = patch.down(was.astype(np.float32)) > 0.5, patch.dots(clicks, 1)
+        barred = patch.dots(self._others_px, 1) & ~seeds
+        apart = _parts(on, barred) & ~_parts(on, seeds)  # a part by itself is the object, or is not
+        apart &= (on & ~apart).any()
+        x = self._mended(patch, on & ~apart, seeds, barred) > 0.5
+        missed, extra = _parts(x & ~on, seeds), _parts(on & ~x & ~apart, barred) | apart
+        add, take = (patch.up(part.astype(np.float32)) > 0.5 for part in (missed, extra))
+        return patch.box, (was[patch.box.slices] & ~take | add).astype(np.float32)
+
+    def _mended(self, patch: Patch, on: np.ndarray, seeds: np.ndarray, barred: np.ndarray) -> np.ndarray:
+        """(h, w) probability of an object whose mask was ``on`` (h, w) bool; ``seeds`` and ``barred`` are certain.
+
+        The mask counts as it was, except where the way to a contradicting click is shorter than that to most of its
+        side: there colours and edges decide, and what depth connects with a click.
+        """
+        missed, extra = seeds & ~on, barred & on
+        may_be_on, may_be_off = _open(patch, ~on, missed, barred), _open(patch, on, extra, seeds)
+        kept, rest = on & ~may_be_off, ~on & ~may_be_on
+        known = np.where(kept, _KEPT, 0) - np.where(rest, _KEPT, 0)
+        if may_be_on.any():
+            known[may_be_on] = _REACHED * self._reached(patch)[may_be_on]
+        own, other, x = kept.astype(np.float32), rest.astype(np.float32), on.astype(np.float32)
+        for _ in range(_ROUNDS_MORE):
+            shares = by_shares(patch, own + _OTHERS * missed, other + _OTHERS * extra, self.config)
+            background = (barred | patch.border()) & ~seeds
+            x = cut(patch, known + shares, start=x, seeds=seeds, background=background, sharp=True)
+            own, other = np.maximum(2 * x - 1, 0), np.maximum(1 - 2 * x, 0)
+        return x
+
+    def _reached(self, patch: Patch) -> np.ndarray:
+        """(h, w) log-odds of what depth connects with the positive clicks."""
+        clicks = self.prompt.points_px
+        z_m = float(np.nanmedian(depths_at(clicks, self.frame)))
+        clicked = Clicked.of(patch, clicks, z_m)
+        height = Height.of(patch, clicked)
+        connected = by_connection(patch, clicked, height, unlike(patch, height.plane))
+        return by_distance(patch, z_m, self.config) + height.log_odds + connected
 
     def _cut_out(
         self, patch: Patch, clicked: Clicked, prior: np.ndarray, geometry: np.ndarray, x: np.ndarray | None = None
@@ -194,6 +231,23 @@ class Cutter:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + ROOM_PX
         return around((low + high) / 2, half, self.frame.shape)
+
+
+def _open(patch: Patch, side: np.ndarray, wrong: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(h, w) bool: what of a side (h, w) bool of an outline is nearer to cells that are ``wrong`` than to most of it.
+
+    Most of it is the third that is farthest from them, and those that are known to be ``right`` (h, w) bool.
+    """
+    if not wrong.any():
+        return np.zeros_like(side)
+    away = patch.away(wrong, _LIKE)
+    most = side & (away >= np.quantile(away[side], 2 / 3))
+    return side & (away < patch.away(most | right & side & ~wrong, _LIKE))
+
+
+def _parts(region: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the parts of a region (h, w) bool that hold a cell of ``at`` (h, w) bool."""
+    return components_touching(connected_components(region), at)
 
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ This module is the order of the stages in a frame; the package's docstring says 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
@@ -26,7 +26,7 @@ from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
-from p2p_lib.segmenters.builtin.start_doubts import doubt_start
+from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
 
@@ -86,7 +86,7 @@ class BuiltinSegmenter:
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
-        new = [name for name in cutters if name not in self._targets]
+        new = cutters.keys() - self._targets.keys()
         masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
@@ -100,7 +100,7 @@ class BuiltinSegmenter:
         claims |= self._refined(frame, prompt_of, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
-        self._doubt_starts(labels, [cutters[name] for name in new])
+        self._doubt_prompts(labels, cutters, new)
         self._previous = frame
         return labels
 
@@ -149,12 +149,14 @@ class BuiltinSegmenter:
         self, view: View, cutter: Cutter, target: Target, hints: Mapping[str, Hint], taken: np.ndarray
     ) -> Claim:
         """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask."""
-        was, name = np.zeros(view.frame.shape, bool), cutter.prompt.name
-        predicted = None if target.seen is None else predict(view, target)
-        if cutter.prompt.box_px is None:
+        was, name, seen = np.zeros(view.frame.shape, bool), cutter.prompt.name, target.seen
+        if cutter.prompt.box_px is None and seen is not None and view.previous is view.frame:
+            was[seen.box.slices] = seen.mask  # the same image once more: that mask is meant
+        elif cutter.prompt.box_px is None:
+            predicted = None if seen is None else predict(view, target)
             _mark(was, self._cut_out(view, name, target, hints, taken, predicted)[1])
         if was.any():
-            return cutter.correct(was, hints.get(name, _NO_HINT).uv_px)
+            return cutter.correct(was)
         return cutter.start() if cutter.prompt.starts else None
 
     def _cut_out(
@@ -231,13 +233,12 @@ class BuiltinSegmenter:
                 part[mask] = 0
         return labels
 
-    def _doubt_starts(self, labels: np.ndarray, cutters: Iterable[Cutter]) -> None:
-        """Warn if a prompt that started an object may have selected something else."""
-        label_of = {name: label for label, name in enumerate(self._targets, 1)}
-        for cutter in cutters:
-            name = cutter.prompt.name
-            others = {other: labels == label for other, label in label_of.items() if other != name}
-            doubt_start(cutter, labels == label_of[name], others)
+    def _doubt_prompts(self, labels: np.ndarray, cutters: Mapping[str, Cutter], new: Collection[str]) -> None:
+        """Warn if a prompt has selected nothing, or if one that started a ``new`` object may be of something else."""
+        masks = {name: labels == label for label, name in enumerate(self._targets, 1)}
+        for name, cutter in cutters.items():
+            others = {other: mask for other, mask in masks.items() if other != name}
+            doubt_prompt(cutter, masks[name], others, name in new)
 
 
 def _cutter(view: View, prompt: Prompt, prompt_of: Mapping[str, Prompt]) -> Cutter:

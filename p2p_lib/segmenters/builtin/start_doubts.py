@@ -25,17 +25,20 @@ _FEW = 10
 _AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
 
 
-def doubt_start(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray]) -> None:
-    """Warn if the prompt that started an object with a mask (H, W) bool may have selected something else.
+def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], starts: bool) -> None:
+    """Warn if a prompt has selected nothing, or one that started an object may have selected something else.
 
-    cutter  the one that cut it out
+    cutter  the one that cut it out, with a mask (H, W) bool
     others  the other objects' masks (H, W) bool in this frame
+    starts  whether it started the object: what was right before its correction is known to the user
     """
     frame, name = cutter.frame, cutter.prompt.name
     who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
     if not mask.any():
         fix = "Click near its centre and on parts of other colours, or draw a box."
         return doubt(who, "no object was found there", fix)
+    if not starts:
+        return None
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)

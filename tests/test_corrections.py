@@ -1,0 +1,95 @@
+"""A mask is corrected by clicks: what the page shows is what a run does, and the run draws it and says what is odd."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+from p2p_lib.apps.click import Clicker
+from p2p_lib.core.config import preset
+from p2p_lib.core.prompts import Prompt
+from p2p_lib.datasets.first_masks import FILE
+from p2p_lib.datasets.images import read_rgb
+from p2p_lib.datasets.prompts import prompts_in
+from p2p_lib.datasets.runs import load_run
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.run import run
+from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+
+FAST = {"method.surface": "false", "method.graph": "false"}
+FRAMES, AT = 8, 5
+HANDLE = 388.0, 262.0
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    """The bundled mug, its start, and a run of it."""
+    sequence = open_sequence("synthetic/mug")
+    (start,) = prompts_in(sequence.masks(0))
+    out = tmp_path_factory.mktemp("runs") / "before"
+    run(sequence, out, prompts=[start], stop=FRAMES, save_masks=True, settings=FAST, progress=False)
+    return sequence, start, load_run(out)
+
+
+def corrected(before, out, **said):
+    """A run with a correction, what it said, and what it doubted of the clicks."""
+    sequence, start, _ = before
+    lines, prompts = [], [start, Prompt(start.name, AT, **said)]
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        how = {"stop": FRAMES, "save_masks": True, "settings": FAST, "say": lines.append}
+        run(sequence, out, prompts=prompts, progress=True, **how)
+    found = [str(d.message) for d in doubts if str(d.message).startswith(("clicks on", "correction of"))]
+    return load_run(out), [line for line in lines if "masks of" in line], found
+
+
+def test_the_page_shows_what_a_correction_makes_of_a_runs_mask(before, tmp_path):
+    """A click beside it takes the handle off, one that agrees changes nothing: the same pixels there and in the run."""
+    sequence, start, was = before
+    kept = was.masks(sequence, AT)[start.name]
+    with Clicker(sequence, tmp_path / "prompts.json", run=was) as clicker:
+        for said, changes in (({"negative_px": [HANDLE]}, True), ({"points_px": [HANDLE]}, False)):
+            shown, doubts = clicker.made([Prompt(start.name, AT, **said)], clicker.kept_masks(AT))
+            run_, _, doubted = corrected(before, tmp_path / str(changes), **said)
+            np.testing.assert_array_equal(run_.masks(sequence, AT)[start.name], shown[start.name])
+            lost = kept & ~shown[start.name]
+            assert bool(lost.any()) == changes and lost.sum() < kept.sum() / 4
+            assert not (shown[start.name] & ~kept).any() and doubts == doubted == []
+
+
+def test_a_click_brings_back_a_part_of_another_colour(before):
+    """The mug without its handle, of which nothing has the colours."""
+    sequence, start, _ = before
+    mug, frame = sequence.masks(AT)[start.name], sequence.frame(AT)
+    segmenter = BuiltinSegmenter(sequence.camera, preset().segmentation)
+    segmenter.segment(frame, [Prompt("mug", AT, mask=mug & (np.arange(640) < HANDLE[0] - 20))])
+    found = segmenter.segment(frame, [Prompt("mug", AT, points_px=[HANDLE])]) == 1
+    assert (found & mug).sum() > 0.98 * (found | mug).sum()
+
+
+def test_clicks_beside_it_take_the_table_off(before):
+    """A strip of it on both sides; what of the mask is nearer to its middle than to the clicks counts as it was."""
+    sequence, start, _ = before
+    mug, frame = sequence.masks(AT)[start.name], sequence.frame(AT)
+    wrong = mug.copy()
+    wrong[301:360, 201:420] = True
+    segmenter = BuiltinSegmenter(sequence.camera, preset().segmentation)
+    segmenter.segment(frame, [Prompt("mug", AT, mask=wrong)])
+    found = segmenter.segment(frame, [Prompt("mug", AT, negative_px=[(410.0, 340.0), (215.0, 330.0)])]) == 1
+    assert (wrong & mug).sum() < 0.7 * wrong.sum() and (found & mug).sum() > 0.95 * (found | mug).sum()
+
+
+def test_a_correction_is_drawn_and_one_that_grows_is_doubted(before, tmp_path):
+    sequence, start, was = before
+    wrong = sequence.masks(AT)[start.name].copy()
+    wrong[250:440, 100:600] = True
+    run_, (first, again), doubted = corrected(before, tmp_path / "run", mask=wrong)
+    assert first.startswith(f"First masks of {start.name} in frame 0: ")
+    assert again == f"Corrected masks of {start.name} in frame {AT}: {tmp_path / 'run' / FILE}"
+    one, two = (read_rgb(of.path / FILE) for of in (was, run_))
+    np.testing.assert_array_equal(two[: len(one), : one.shape[1]], one)
+    assert len(two) > len(one)
+    (doubt,) = doubted
+    assert re.match(rf"correction of '{start.name}' in frame {AT}: its mask is \d+ cm long now, \d\.\d times", doubt)
+    assert doubt in run_.info["doubts"]
