@@ -7,7 +7,7 @@ It is written into a folder of its own, by one process at a time: nothing is del
     config.toml           every parameter
     run.json              what ran on what: sequence, objects, tracker, masks, preset, seed, versions, commit; what was
                           doubted meanwhile and, at the end, what to look at before it is believed
-    first_masks.png       what each object was started with, and what corrections made (:mod:`p2p_lib.datasets.first_masks`)
+    first_masks.png       what objects were started with, and corrections (:mod:`p2p_lib.datasets.first_masks`)
     poses/<object>.txt    TUM: time_s tx ty tz qx qy qz qw of T_cam_obj; frames without a pose are left out,
                           and so are poses in maps that were given up since (``map_id`` in ``poses.npz``); poses in a
                           map that became part of the last one since are in its frame

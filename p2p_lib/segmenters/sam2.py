@@ -13,7 +13,7 @@ an earlier frame is carried to the newest one by the object's motion (:mod:`p2p_
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -84,11 +84,11 @@ class Question:
     looks: np.ndarray | None = None
 
     @classmethod
-    def of_prompt(cls, prompt: Prompt, found: np.ndarray, others_px: np.ndarray) -> Question:
-        """Of a prompt and the mask (H, W) bool that the built-in segmenter made of it."""
+    def of_prompt(cls, prompt: Prompt, found: np.ndarray, others_px: np.ndarray, corrects: bool) -> Question:
+        """Of a prompt and the mask (H, W) bool that the built-in segmenter made of it; ``corrects`` one that was."""
         own_px = prompt.points_px
-        if not len(own_px) and prompt.box_px is None:  # negative clicks alone: the rest of it stays
-            own_px = _spread(_middle(found), _MIDDLE)
+        if corrects:  # a click on a part is not meant to select that part alone
+            own_px = np.concatenate([own_px, _spread(_middle(found), _MIDDLE)])
         asked = replace(prompt, points_px=own_px) if len(own_px) else prompt
         return cls(asked, own_px, np.concatenate([prompt.negative_px, others_px]))
 
@@ -195,11 +195,13 @@ class Sam2Refiner:
         prompts: Mapping[str, Prompt],
         found: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
+        corrected: Collection[str] = (),
     ) -> dict[str, np.ndarray]:
         """Better masks (H, W) bool of some of the objects in this frame.
 
-        prompts  those of this frame that are no masks
-        found    every object that the segmenter located, to its mask (H, W) bool, which may be empty
+        prompts    those of this frame that are no masks
+        found      every object that the segmenter located, to its mask (H, W) bool, which may be empty
+        corrected  the objects whose masks the prompts correct
         """
         executor = self._executor if self._frames else None  # the first image waits
         due = self._every is not None and (executor is not None or self._frames % self._every == 0)
@@ -208,7 +210,7 @@ class Sam2Refiner:
             self._working = None  # what is thought of it is wrong, as the answer to come may be
         self._place(frame, hints)
         arrived = self._arrived(frame, found, hints)
-        if self._working is None and (questions := self._questions(frame, prompts, found, hints, due)):
+        if self._working is None and (questions := self._questions(frame, prompts, found, hints, corrected, due)):
             T_cam_obj = {name: hints.get(name, _NO_HINT).T_cam_obj for name in questions}
             if executor is None:
                 answers = _answers(self._network, frame, questions)
@@ -232,6 +234,7 @@ class Sam2Refiner:
         prompts: Mapping[str, Prompt],
         found: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
+        corrected: Collection[str],
         followed: bool,
     ) -> dict[str, Question]:
         """By object; of the ``followed`` ones too, or of those with prompts alone."""
@@ -241,7 +244,7 @@ class Sam2Refiner:
         for name in names:
             others_px = np.concatenate([_NO_PX, *(px for other, px in known_px.items() if other != name)])
             if name in prompts:
-                questions[name] = Question.of_prompt(prompts[name], found[name], others_px)
+                questions[name] = Question.of_prompt(prompts[name], found[name], others_px, name in corrected)
                 self._answered.pop(name, None)  # what was thought of it was wrong
                 continue
             hint, known = hints.get(name, _NO_HINT), self._answered.get(name)

@@ -131,16 +131,16 @@ def test_another_objects_click_rules_a_candidate_out():
     red, both = mask_of(RED_PX), mask_of(RED_PX) | mask_of(GREEN_PX)
     two = offered(red, both, score=[0.7, 0.99])
     prompt = Prompt("red", points_px=AT_RED)
-    assert iou(Question.of_prompt(prompt, both, np.zeros((0, 2))).answer(two, FEATURES), both) > 0.95
-    assert iou(Question.of_prompt(prompt, both, np.array(AT_GREEN)).answer(two, FEATURES), red) > 0.95
+    assert iou(Question.of_prompt(prompt, both, np.zeros((0, 2)), False).answer(two, FEATURES), both) > 0.95
+    assert iou(Question.of_prompt(prompt, both, np.array(AT_GREEN), False).answer(two, FEATURES), red) > 0.95
 
 
 def test_nothing_is_taken_where_nothing_fits():
-    question = Question.of_prompt(Prompt("red", points_px=AT_RED), mask_of(RED_PX), np.zeros((0, 2)))
+    question = Question.of_prompt(Prompt("red", points_px=AT_RED), mask_of(RED_PX), np.zeros((0, 2)), False)
     assert question.answer(offered(mask_of(GREEN_PX), score=[0.99]), FEATURES) is None
     assert question.answer(offered(mask_of(RED_PX), score=[0.1]), FEATURES) is None
     assert question.answer(offered(mask_of(RED_PX), score=[0.9]), FEATURES) is not None
-    beside = Question.of_prompt(Prompt("red", points_px=AT_RED), mask_of(RED_PX), np.array(AT_GREEN))
+    beside = Question.of_prompt(Prompt("red", points_px=AT_RED), mask_of(RED_PX), np.array(AT_GREEN), False)
     assert beside.answer(offered(mask_of(RED_PX) | mask_of(GREEN_PX), score=[0.99]), FEATURES) is None
 
 
@@ -167,7 +167,7 @@ def test_specks_and_pinholes_go_and_a_handle_stays():
     mask[80:120, 100:130] = False
     dirty = mask.copy()
     dirty[10:14, 10:14], dirty[60:63, 60:63] = True, False
-    question = Question.of_prompt(Prompt("a", points_px=[[55, 55]]), mask, np.zeros((0, 2)))
+    question = Question.of_prompt(Prompt("a", points_px=[[55, 55]]), mask, np.zeros((0, 2)), False)
     assert iou(question.answer(offered(dirty, score=[0.9]), FEATURES), mask) > 0.97
     assert not question.answer(offered(dirty, score=[0.9]), FEATURES)[10:14, 10:14].any()
 
@@ -209,13 +209,17 @@ def test_who_clicks_on_one_image_again_and_again_waits_once(network):
     assert (len(network._encoder.fed), len(network._decoder.fed)) == (2, 7)
 
 
-def test_a_correction_beside_the_object_keeps_the_rest_of_it(network):
+@pytest.mark.parametrize(
+    ("said", "on", "beside"), [({"negative_px": [[150.0, 150]]}, 3, 1), ({"points_px": AT_RED[:1]}, 4, 0)]
+)
+def test_a_correction_keeps_the_rest_of_the_object(network, said, on, beside):
+    """The network is asked with the middle of the mask, too: a click on a part is not meant to select that part."""
     of = segmenter(network)
     of.segment(frame_of(), prompts())
-    labels = of.segment(frame_of(1), [Prompt("red", negative_px=[[150.0, 150]])])
+    labels = of.segment(frame_of(1), [Prompt("red", **said)])
     assert iou(labels == 1, mask_of(RED_PX)) > 0.9
     kinds = network._decoder.fed[-1]["point_labels"][0]
-    assert (kinds == 1).sum() == 3 and (kinds == 0).sum() == 1
+    assert ((kinds == 1).sum(), (kinds == 0).sum()) == (on, beside)
 
 
 def test_the_built_in_mask_stays_where_no_candidate_fits(network):

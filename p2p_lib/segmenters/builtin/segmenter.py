@@ -48,8 +48,12 @@ class Refiner(Protocol):
         prompts: Mapping[str, Prompt],
         masks: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
+        corrected: Collection[str] = (),
     ) -> dict[str, np.ndarray]:
-        """Better masks (H, W) bool of some of the objects in this frame; the others keep theirs."""
+        """Better masks (H, W) bool of some of the objects in this frame; the others keep theirs.
+
+        corrected  the objects whose masks the prompts correct
+        """
 
 
 class BuiltinSegmenter:
@@ -87,6 +91,7 @@ class BuiltinSegmenter:
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
         new = cutters.keys() - self._targets.keys()
+        corrected = [name for name in cutters.keys() - new if self._targets[name].in_view]
         masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
@@ -97,7 +102,7 @@ class BuiltinSegmenter:
                 asked = cutters.get(name), hints, taken, name in due
                 self._targets[name], claims[name] = self._locate(view, name, *asked)
                 _mark(taken, claims[name])
-        claims |= self._refined(frame, prompt_of, claims, hints)
+        claims |= self._refined(frame, prompt_of, claims, hints, corrected)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
         self._doubt_prompts(labels, cutters, new)
@@ -193,7 +198,12 @@ class BuiltinSegmenter:
         return target, claim
 
     def _refined(
-        self, frame: Frame, prompt_of: Mapping[str, Prompt], claims: Mapping[str, Claim], hints: Mapping[str, Hint]
+        self,
+        frame: Frame,
+        prompt_of: Mapping[str, Prompt],
+        claims: Mapping[str, Claim],
+        hints: Mapping[str, Hint],
+        corrected: Collection[str],
     ) -> dict[str, Claim]:
         """The refiner's claims, of the objects whose masks it replaces."""
         if self._refiner is None:
@@ -202,7 +212,7 @@ class BuiltinSegmenter:
         for name, claim in claims.items():
             _mark(masks[name], claim)
         prompts = {name: prompt for name, prompt in prompt_of.items() if prompt.mask is None}
-        refined, whole = self._refiner.refine(frame, prompts, masks, hints), Box(0, 0, *frame.shape[::-1])
+        refined, whole = self._refiner.refine(frame, prompts, masks, hints, corrected), Box(0, 0, *frame.shape[::-1])
         return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
     @staticmethod
