@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from p2p_lib.core.errors import Doubt, Doubts, doubt
+from p2p_lib.core.errors import Doubt, Doubts
 from p2p_lib.core.mesh import save as save_mesh
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate
@@ -24,7 +24,7 @@ from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.consistency import consistency
-from p2p_lib.evaluation.suspicions import GROWN
+from p2p_lib.evaluation.suspicions import doubt_growth
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.extended.saving import keep_memory
 
@@ -80,11 +80,8 @@ class Keeper:
                 self.mask_log.add(frame, name, mask)
         new, corrected = self.first_masks.add(frame, method.masks)
         for name in corrected:
-            length_m, factor = self.mask_log.growth(name)
-            if factor > GROWN:
-                got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"
-                fix = "If it holds more than the object: negative clicks on what is not it, a box, or a painted mask."
-                doubt(f"correction of {name!r} in frame {frame.index}", got, fix)
+            *before_m, length_m = self.mask_log.lengths_m(name)
+            doubt_growth(name, frame.index, length_m, np.array(before_m))
         return new, corrected
 
     def save_maps(self) -> None:

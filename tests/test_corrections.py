@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
+from p2p_lib.apps.check import check_folder
 from p2p_lib.apps.click import Clicker
 from p2p_lib.core.config import preset
 from p2p_lib.core.prompts import Prompt
@@ -18,7 +19,7 @@ from p2p_lib.run import run
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
 FAST = {"method.surface": "false", "method.graph": "false"}
-FRAMES, AT = 8, 5
+FRAMES, AT = 8, 4  # in which the mask is moved by the flow alone
 HANDLE = 388.0, 262.0
 
 
@@ -93,3 +94,15 @@ def test_a_correction_is_drawn_and_one_that_grows_is_doubted(before, tmp_path):
     (doubt,) = doubted
     assert re.match(rf"correction of '{start.name}' in frame {AT}: its mask is \d+ cm long now, \d\.\d times", doubt)
     assert doubt in run_.info["doubts"]
+
+
+def test_a_box_around_too_much_is_doubted_on_the_page_and_by_a_check(before, tmp_path):
+    """Before a run is made of it; what clicks make of a mask nobody knows before a run."""
+    sequence, start, was = before
+    wrong, right = (Prompt(start.name, AT, box_px=box) for box in ((20, 250, 620, 470), (240, 165, 405, 340)))
+    with Clicker(sequence, tmp_path / "prompts.json", run=was) as clicker:
+        for prompt, many in ((wrong, True), (right, False)):
+            _, doubts = clicker.made([prompt], clicker.kept_masks(AT))
+            checked = [f.text for f in check_folder("synthetic/mug", prompts=[start, prompt]) if "clicks" in f.name]
+            for texts in (doubts, checked):
+                assert any("times as long as before" in text for text in texts) == many

@@ -34,6 +34,7 @@ from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.evaluation.known_size import size_doubt
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
+from p2p_lib.evaluation.suspicions import doubt_growth
 from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
@@ -112,6 +113,7 @@ def check_folder(
         try:
             firsts = clicked_masks(sequence, prompts, config) if prompts else _first_masks(sequence, config)
             check_depths(sequence, prompts)
+            _doubt_boxes(sequence, prompts, firsts, config)
         except P2PError as error:
             firsts = {}
             wrong.append(_unreadable("clicks" if prompts else "masks", error))
@@ -346,6 +348,16 @@ def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) ->
     what = f"only {count} pixels were segmented" if count else "nothing was segmented"
     text = f"{what} at the clicks on it in frame {frame.index}; {needed} pixels are needed"
     return Finding(f"{name}: mask", Level.WRONG, text, "Click again, near the centre of the object: p2p click.")
+
+
+def _doubt_boxes(sequence: Sequence, prompts: Iterable[Prompt], firsts: FirstMasks, config: Config) -> None:
+    """Warn of boxes and masks that make an object longer than its first mask; what later clicks make, a run knows."""
+    for prompt in prompts:
+        if prompt.frame <= firsts[prompt.name][0].index or (prompt.box_px is None and prompt.mask is None):
+            continue
+        (later,) = clicked_masks(sequence, [prompt], config).values()
+        first_m, later_m = (mask_length_m(*of, sequence.camera) for of in (firsts[prompt.name], later))
+        doubt_growth(prompt.name, prompt.frame, later_m, np.array([first_m]))
 
 
 def _misspelt(name: str, firsts: FirstMasks) -> list[Finding]:

@@ -31,9 +31,11 @@ from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
 from p2p_lib.core.prompts import Prompt, check_depth
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.mask_log import load_masks, mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, run_lengths, save_prompts
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.evaluation.suspicions import doubt_growth
 
 #: Object to a frame and its mask (H, W) bool there.
 FirstMasks = dict[str, tuple[Frame, np.ndarray]]
@@ -132,8 +134,18 @@ class Clicker(AbstractContextManager):
         with self._segmenting, warnings.catch_warnings(record=True) as doubts:
             warnings.simplefilter("always", Doubt)
             made = clicked_masks(self.sequence, [p for p in prompts if p.starts or p.name in was], was=was)
+            for name in made.keys() & was.keys():
+                frame, mask = made[name]
+                length_m = mask_length_m(frame, mask, self.sequence.camera)
+                doubt_growth(name, frame.index, length_m, self._before_m(name, frame, was[name]))
         texts = [str(doubt.message) for doubt in doubts if issubclass(doubt.category, Doubt)]
         return {name: mask for name, (_, mask) in made.items()}, texts
+
+    def _before_m(self, name: str, frame: Frame, kept: np.ndarray) -> np.ndarray:
+        """Lengths of an object's masks before a frame of the run, m; without a run that of the mask that is kept."""
+        if (log := load_masks(self.run.path).get(name) if self.run else None) is not None:
+            return log.size_m[log.frame_index < frame.index]
+        return np.array([mask_length_m(frame, kept, self.sequence.camera)])
 
     def checked(self, content: object, started: Iterable[str] = ()) -> tuple[Prompt, ...]:
         """The prompts that the page sends; objects that are ``started`` may be corrected alone."""

@@ -96,11 +96,9 @@ class MaskLog:
         box = (*low.tolist(), *(high - low).tolist())
         self._rows[name].append(_Row(frame.index, int(np.count_nonzero(mask)), box, bits, *_measured(p_cam)))
 
-    def growth(self, name: str) -> tuple[float, float]:
-        """The length of an object's newest mask, m, and over the median of those before; NaN: not measured."""
-        *before, newest = [row.size_m for row in self._rows[name]]
-        known = np.array(before)[np.isfinite(before)]
-        return newest, newest / float(np.median(known)) if len(known) else float("nan")
+    def lengths_m(self, name: str) -> np.ndarray:
+        """(n,) the length of what an object's masks hold so far, the newest last; NaN where nothing was measured."""
+        return np.array([row.size_m for row in self._rows[name]])
 
     def save(self, folder: Path) -> None:
         """Write the file."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from p2p_lib.core.errors import doubt
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
@@ -170,6 +171,15 @@ _RULES = (
         lambda e: e.seen & np.isfinite(e.size_m),
     ),
 )
+
+
+def doubt_growth(name: str, frame_index: int, length_m: float, before_m: np.ndarray) -> None:
+    """Warn of a correction that makes an object's mask much longer than it was in frames before, m; NaN: unknown."""
+    factor = length_m / median_of_known(before_m)
+    if factor > GROWN:
+        got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"
+        fix = "If it holds more than the object: negative clicks on what is not it, a box, or a painted mask."
+        doubt(f"correction of {name!r} in frame {frame_index}", got, fix)
 
 
 def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:

@@ -136,8 +136,14 @@ class BuiltinSegmenter:
         """Locate one object outside what is ``taken`` (H, W) bool; the updated target and its probability map."""
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
         if cutter is not None:
-            claim = self._segment_prompt(view, cutter, target, hints, taken)
+            claim = self._segment_prompt(view, cutter, target, hints, taken, due)
             return Target(), claim  # its colours and its size are learnt anew
+        return self._follow(view, name, target, hints, taken, due)
+
+    def _follow(
+        self, view: View, name: str, target: Target, hints: Mapping[str, Hint], taken: np.ndarray, due: bool
+    ) -> tuple[Target, Claim]:
+        """Move an object's mask by the optical flow where that is enough, else cut it out anew, or find it."""
         predicted = None if target.seen is None else predict(view, target)
         if predicted is not None and not (self._cuts(target, due) or predicted.doubtful):
             return target, predicted.claim
@@ -151,15 +157,14 @@ class BuiltinSegmenter:
         return [hints.get(other, _NO_HINT) for other, at in seen.items() if at.box.near(box, _BESIDE_PX)]
 
     def _segment_prompt(
-        self, view: View, cutter: Cutter, target: Target, hints: Mapping[str, Hint], taken: np.ndarray
+        self, view: View, cutter: Cutter, target: Target, hints: Mapping[str, Hint], taken: np.ndarray, due: bool
     ) -> Claim:
         """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask."""
         was, name, seen = np.zeros(view.frame.shape, bool), cutter.prompt.name, target.seen
         if cutter.prompt.box_px is None and seen is not None and view.previous is view.frame:
             was[seen.box.slices] = seen.mask  # the same image once more: that mask is meant
         elif cutter.prompt.box_px is None:
-            predicted = None if seen is None else predict(view, target)
-            _mark(was, self._cut_out(view, name, target, hints, taken, predicted)[1])
+            _mark(was, self._follow(view, name, target, hints, taken, due)[1])
         if was.any():
             return cutter.correct(was)
         return cutter.start() if cutter.prompt.starts else None
