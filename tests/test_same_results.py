@@ -50,9 +50,9 @@ def notes(tmp_path):
 
 def test_where_runs_from_clicks_differ_tables_without_them_stand(same, notes):
     stand = same.restamp(notes, "a", "b", 12, clicks=False)
-    assert stand == ["drawn.json", "films.json", "rates.json", "trackers.json"]
+    assert stand == ["drawn.json", "faults.json", "films.json", "rates.json", "trackers.json"]
 
 
-def test_tables_of_another_film_and_of_faults_do_not_stand(same, notes):
-    stand = same.restamp(notes, "a", "b", 12, films={"synthetic/in_hand"})
+def test_tables_of_another_film_and_of_faults_that_were_not_compared_do_not_stand(same, notes):
+    stand = same.restamp(notes, "a", "b", 12, films={"synthetic/in_hand"}, faults=False)
     assert stand == ["drawn.json", "of_readme.json", "rates.json", "readme.json", "trackers.json"]

@@ -3,13 +3,13 @@
     python tools/same_results.py COMMIT [--only SEQUENCE ...]
 
 For a change that decides no pose: names, types, messages, what is kept and shown; or none but of runs from clicks. Runs
-of both presets, of 2D trackers that need no weights, and of every source of masks are made with the library of COMMIT
-and with this one, and every array of their poses, keypoints and masks is compared. Where all are the same, tables and
-figures whose note has the digest of COMMIT's code get this code's, and ``same_as``: the digest that they were made
-with, and how many runs were compared. Where runs from clicks alone differ, those get it whose plan has none. Ends with
-exit code 1 where another run differs; then nothing is written. Sequences below ``$P2P_DATA`` are compared where they
-are there. Where a bundled sequence is another film than it was, its runs tell nothing, and plans with it stay of
-earlier code; so do plans with faults, of which there is no run here.
+of both presets, of 2D trackers that need no weights, of every source of masks and of some faults are made with the
+library of COMMIT and with this one, and every array of their poses, keypoints and masks is compared. Where all are the
+same, tables and figures whose note has the digest of COMMIT's code get this code's, and ``same_as``: the digest that
+they were made with, and how many runs were compared. Where runs from clicks alone differ, those get it whose plan has
+none. Ends with exit code 1 where another run differs; then nothing is written. Sequences below ``$P2P_DATA`` are
+compared where they are there. Where a bundled sequence is another film than it was, its runs tell nothing, and plans
+with it stay of earlier code.
 """
 
 from __future__ import annotations
@@ -49,6 +49,16 @@ CASES: tuple[tuple[str, ...], ...] = (
     ("desk_fast", "--prompts", "p2p_lib/benchmark/prompts/desk_fast.json"),
     ("YCBInEOAT/mustard0", "--masks", "first", "--stop", "150"),
 )
+#: Faults, with their severity, of frames 30 to 60 of ``synthetic/crossing``.
+FAULTS = (
+    ("none", 1.0),
+    ("depth scaled", 1.2),
+    ("depth frozen", 1.0),
+    ("depth holes", 0.9),
+    ("mask whole image", 1.0),
+    ("frames dropped", 1.0),
+    ("time shifted", 10.0),
+)
 #: What makes a run start from clicks.
 CLICKS = ("clicks", "--prompts")
 ARRAYS = ("poses.npz", "keypoints.npz", "masks.npz")
@@ -62,6 +72,13 @@ film, said = open_sequence(sys.argv[1], progress=False), hashlib.sha256()
 for frame in [film.frame(i) for i in np.linspace(0, len(film) - 1, 5).astype(int)]:
     said.update(frame.rgb.tobytes() + frame.depth_m.tobytes())
 print(said.hexdigest(), len(film))"""
+_FAULTY = """import sys
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.run import run
+from p2p_lib.synthetic.faults import Faulty
+fault, severity, out = sys.argv[1:]
+film = open_sequence("synthetic/crossing", progress=False)
+run(Faulty(film, fault, float(severity), 30, 60), out, stop=100, progress=False)"""
 _P2P = "import sys; from p2p_lib.apps.cli import main; sys.exit(main())"
 
 
@@ -108,12 +125,19 @@ def from_clicks(plan: Plan) -> bool:
 
 
 def restamp(
-    folder: Path, was: str, now: str, compared: int, clicks: bool = True, films: Collection[str] = ()
+    folder: Path,
+    was: str,
+    now: str,
+    compared: int,
+    clicks: bool = True,
+    films: Collection[str] = (),
+    faults: bool = True,
 ) -> list[str]:
     """Give notes that hold the digest ``was`` the digest ``now``, and say so in them; the names of their files.
 
     clicks  also those of runs from clicks
     films   sequences that are other films than they were
+    faults  also those of runs with faults
     """
     changed = []
     for path in sorted([*folder.glob("*.json"), *folder.glob("tables/*.json")]):
@@ -121,7 +145,9 @@ def restamp(
         if note.get("code") != was:
             continue
         if any(
-            (from_clicks(plan) and not clicks) or plan.full.fault or {*films} & {s.name for s in plan.full.sequence}
+            (from_clicks(plan) and not clicks)
+            or (plan.full.fault and not faults)
+            or {*films} & {s.name for s in plan.full.sequence}
             for plan in plans(note)
         ):
             continue
@@ -161,8 +187,18 @@ def main() -> int:
             if differ and not {*options} & {*CLICKS}:
                 return 1
             clicks_too &= not differ
-    stand = restamp(FIGURES, was, now, same, clicks_too, films)
-    print(f"{same} of {len(cases)} runs are the same; {was} -> {now}:", *stand)
+        faults = [] if asked.only or "synthetic/crossing" in films else list(FAULTS)
+        for fault, severity in faults:
+            runs = [Path(scratch) / f"{fault}_{side}" for side in ("before", "now")]
+            for library, out in zip((before, ROOT), runs, strict=True):
+                python(library, "-c", _FAULTY, fault, str(severity), str(out))
+            differ = differences(*runs)
+            print(f"{'differs' if differ else 'same'}: fault {fault}", *differ[:5], flush=True)
+            if differ:
+                return 1
+            same += 1
+    stand = restamp(FIGURES, was, now, same, clicks_too, films, bool(faults))
+    print(f"{same} of {len(cases) + len(faults)} runs are the same; {was} -> {now}:", *stand)
     return 0
 
 
