@@ -66,7 +66,7 @@ def test_corrections_follow_what_starts_the_object():
         (Prompt("mug", 2, mask=np.ones((W, H), bool)), "60x80, expected 80x60"),
         (Prompt("mug", 2, mask=np.zeros((H, W), bool)), "nothing on it"),
         (Prompt("mug", 2, box_px=(-30, 4, -10, 9)), "a box within 80x60"),
-        (Prompt("mug", 2, [[3, 3]], negative_px=[[200, 3]]), r"negative clicks of 'mug': got \(200, 3\)"),
+        (Prompt("mug", 2, [[3, 3]], negative_px=[[200, 3]]), r"negative clicks of 'mug' in frame 2: got \(200, 3\)"),
     ):
         with pytest.raises(BadInput, match=why):
             prompts_by_frame([prompt], range(10), CAMERA)
