@@ -9,6 +9,7 @@ import pytest
 from p2p_lib.apps.check import check_folder
 from p2p_lib.apps.click import Clicker
 from p2p_lib.core.config import preset
+from p2p_lib.core.errors import BadInput
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets.first_masks import FILE
 from p2p_lib.datasets.images import read_rgb
@@ -106,3 +107,16 @@ def test_a_box_around_too_much_is_doubted_on_the_page_and_by_a_check(before, tmp
             checked = [f.text for f in check_folder("synthetic/mug", prompts=[start, prompt]) if "clicks" in f.name]
             for texts in (doubts, checked):
                 assert any("times as long as before" in text for text in texts) == many
+
+
+def test_a_mask_that_says_hidden_is_no_trouble_to_a_check(before):
+    """An empty mask in a later frame says that the object is not in view: it has no length."""
+    _, start, _ = before
+    hidden = Prompt(start.name, AT, mask=np.zeros((480, 640), bool))
+    assert not [f.text for f in check_folder("synthetic/mug", prompts=[start, hidden]) if "clicks" in f.name]
+
+
+def test_a_misspelt_object_is_asked_about(before, tmp_path):
+    sequence, start, _ = before
+    with pytest.raises(BadInput, match="Did you mean mug"):
+        run(sequence, tmp_path / "none", prompts=[start], objects=["mugg"], progress=False)

@@ -353,7 +353,8 @@ def _nothing_there(name: str, frame: Frame, mask: np.ndarray, config: Config) ->
 def _doubt_boxes(sequence: Sequence, prompts: Iterable[Prompt], firsts: FirstMasks, config: Config) -> None:
     """Warn of boxes and masks that make an object longer than its first mask; what later clicks make, a run knows."""
     for prompt in prompts:
-        if prompt.frame <= firsts[prompt.name][0].index or (prompt.box_px is None and prompt.mask is None):
+        said = prompt.box_px is not None or (prompt.mask is not None and prompt.mask.any())
+        if not said or prompt.frame <= firsts[prompt.name][0].index:
             continue
         (later,) = clicked_masks(sequence, [prompt], config).values()
         first_m, later_m = (mask_length_m(*of, sequence.camera) for of in (firsts[prompt.name], later))

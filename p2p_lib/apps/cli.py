@@ -280,10 +280,10 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
         warn("p2p eval: --models is not used, because the run has no truth.")
     for name, text in size_doubts(a.run, known_m).items() if score else ():
         warn(f"p2p eval: {name}: {text}")
-    scored = () if score is None else [name for name, obj in run.objects.items() if obj.has_truth.any()]
-    others = {name: obj for name, obj in run.objects.items() if name not in scored}
-    judged = replace(consistency(replace(run, objects=others), known_m=known_m), not_scored=not_scored)
-    _show(score or judged, a.json, bool(run.info.get("offline")), judged if score and others else None)
+    rest = run.objects if score is None else {n: obj for n, obj in run.objects.items() if not obj.has_truth.any()}
+    judged = replace(consistency(replace(run, objects=rest), known_m=known_m), not_scored=not_scored) if rest else None
+    said = [of for of in (score, judged) if of is not None]
+    _show(said[0], a.json, bool(run.info.get("offline")), *said[1:])
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
@@ -550,12 +550,12 @@ def _film_wanted(path: Path | None) -> Callable[..., Path] | None:
 
 def _show(score: Any, as_json: bool, offline: bool = False, others: Any = None) -> None:
     """A score, and what is said of the ``others``, objects that it is not of."""
-    both = [score] if others is None else [score, others]
     if as_json:
-        more = {} if others is None else {"others": others.as_dict()}
-        print(json.dumps(score.as_dict() | more | ({"offline": True} if offline else {})))
+        more = ({"others": others.as_dict()} if others else {}) | ({"offline": True} if offline else {})
+        print(json.dumps(score.as_dict() | more))
     else:
-        print("\n".join([*(of.as_table() for of in both), *[NOT_CAUSAL] * offline]))
+        tables = [of.as_table() for of in (score, others) if of is not None]
+        print("\n".join([*tables, *[NOT_CAUSAL] * offline]))
 
 
 from p2p_lib.apps import data_commands  # noqa: E402, F401 - declared, and listed by --help, after those above

@@ -44,9 +44,9 @@ class FirstMasks:
         seen = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
         said = sorted((p for p in self._prompts if p.frame <= frame.index), key=lambda p: p.frame)
         newest = {prompt.name: prompt for prompt in said}
+        now = {name for name, prompt in newest.items() if prompt.frame == frame.index}
         new = {name: mask for name, mask in seen.items() if name not in self._followed}
-        again = {name: mask for name, mask in seen.items() if name in newest and newest[name].frame == frame.index}
-        again = {name: mask for name, mask in again.items() if name in self._followed}
+        again = {name: mask for name, mask in seen.items() if name in self._followed & now}
         self._followed |= new.keys()
         self._started = list(dict.fromkeys([*self._started, *new]))
         for title, drawn, panels in (("first", new, self._panels), ("corrected", again, self._corrected)):

@@ -210,7 +210,11 @@ def test_who_clicks_on_one_image_again_and_again_waits_once(network):
 
 
 @pytest.mark.parametrize(
-    ("said", "on", "beside"), [({"negative_px": [[150.0, 150]]}, 3, 1), ({"points_px": AT_RED[:1]}, 4, 0)]
+    ("said", "on", "beside"),
+    [
+        ({"negative_px": [[150.0, 150]]}, 3, 1),
+        ({"points_px": AT_RED[:1]}, 4, 0),
+    ],
 )
 def test_a_correction_keeps_the_rest_of_the_object(network, said, on, beside):
     """The network is asked with the middle of the mask, too: a click on a part is not meant to select that part."""
@@ -220,6 +224,15 @@ def test_a_correction_keeps_the_rest_of_the_object(network, said, on, beside):
     assert iou(labels == 1, mask_of(RED_PX)) > 0.9
     kinds = network._decoder.fed[-1]["point_labels"][0]
     assert ((kinds == 1).sum(), (kinds == 0).sum()) == (on, beside)
+
+
+def test_a_box_that_corrects_a_mask_is_asked_with_by_itself(network):
+    """It says what the whole is: the mask that it replaces may be something else."""
+    of = segmenter(network)
+    of.segment(frame_of(), prompts())
+    of.segment(frame_of(1), [Prompt("red", box_px=(58, 48, 101, 111))])
+    kinds = network._decoder.fed[-1]["point_labels"][0]
+    assert not (kinds == 1).any() and (kinds == 2).sum() == (kinds == 3).sum() == 1
 
 
 def test_the_built_in_mask_stays_where_no_candidate_fits(network):

@@ -24,7 +24,6 @@ from p2p_lib.segmenters.builtin.patch import (
     around,
     components_touching,
     connected_components,
-    dilated,
     keep_seeded_components,
 )
 from p2p_lib.segmenters.builtin.start_evidence import (
@@ -162,9 +161,7 @@ class Cutter:
         x = self._mended(patch, on & ~apart, seeds, barred) > 0.5
         missed, extra = _parts(x & ~on, seeds), _parts(on & ~x & ~apart, barred) | apart
         add, take = (patch.up(part.astype(np.float32)) > 0.5 for part in (missed, extra))
-        mended = was[patch.box.slices] & ~take | add
-        seam = dilated(add, 1) & dilated(was[patch.box.slices] & ~take, 1) & ~take  # between cells and pixels
-        return patch.box, (mended | seam).astype(np.float32)
+        return patch.box, (was[patch.box.slices] & ~take | add).astype(np.float32)
 
     def _mended(self, patch: Patch, on: np.ndarray, seeds: np.ndarray, barred: np.ndarray) -> np.ndarray:
         """(h, w) probability of an object whose mask was ``on`` (h, w) bool; ``seeds`` and ``barred`` are certain.

@@ -91,7 +91,11 @@ class BuiltinSegmenter:
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
         new = cutters.keys() - self._targets.keys()
-        corrected = [name for name in cutters.keys() - new if self._targets[name].in_view]
+        corrected = [
+            name
+            for name, cutter in cutters.items()
+            if cutter.prompt.box_px is None and self._targets.get(name, Target()).in_view
+        ]
         masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
