@@ -47,7 +47,7 @@ def neighbours(p_cam: np.ndarray, distance_m: float) -> np.ndarray:
         strip = np.floor(p_cam[:, across] / (distance_m / 2))
         # Within a strip the keys run along it; strips lie farther apart than any pair.
         key = strip * (np.ptp(p_cam[:, along]) + 4 * distance_m) + p_cam[:, along]
-        order = np.argsort(key)
+        order = np.argsort(key, kind="stable")
         nearest = np.searchsorted(key[order], key + distance_m)
         first = np.flatnonzero(nearest < len(key))
         pairs.append(np.stack([first, order[nearest[first]]]))

@@ -45,6 +45,7 @@ MECHANISMS = {
     # Inside: policy, motion.
     "motion_prior": "The last pose and constant velocity propose poses; without points the surface tracks them.",
     "motion_weight": "A hypothesis needs more support the farther it is from the predicted motion.",
+    "votes": "New points that contradict keypoints which agreed with earlier poses need to be many more.",
     "motion_over_gaps": "The motion of an absent object is extrapolated for a while.",
     "moving_points": "A point becomes a keypoint only if it moves with the object.",
     "pending_points": "While an object is followed, pending points help to register it.",

@@ -106,7 +106,9 @@ class ImageSearch:
             return None
         poses = _shifted(T_cam_obj, _STEP_M, _STEPS)
         share = self._roughly(poses, sample) - _strayed(poses, T_cam_obj, sample)
-        return self._best(self._all_aligned(poses[np.argsort(-share)[:_TRIED]], sample), sample, T_cam_obj)
+        return self._best(
+            self._all_aligned(poses[np.argsort(-share, kind="stable")[:_TRIED]], sample), sample, T_cam_obj
+        )
 
     def turned(self, turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The best pose near the turns of T_cam_obj (V, 4, 4), for an object with these depth points (M, 3)."""
@@ -152,7 +154,7 @@ class ImageSearch:
             return []
         share = self._roughly(poses, sample)
         best: list[int] = []
-        for k in np.argsort(-share)[:_RANKED]:
+        for k in np.argsort(-share, kind="stable")[:_RANKED]:
             apart_m = np.linalg.norm(poses[best, :3, 3] - poses[k, :3, 3], axis=1)
             turned = se3.angle_rad(se3.inverse(poses[best]) @ poses[k])
             if np.isfinite(share[k]) and ((apart_m > _STEP_M) | (turned > _APART_RAD)).all():
@@ -170,7 +172,7 @@ class ImageSearch:
         poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in laid_on(turns, cloud, sample)])
         share, distinct = self._roughly(poses, sample), []
         turn_of, free = np.arange(len(poses)) // (len(poses) // len(turns)), np.ones(len(turns), bool)
-        for k in np.argsort(-share):
+        for k in np.argsort(-share, kind="stable"):
             if np.isfinite(share[k]) and free[turn_of[k]]:
                 distinct.append(k)
                 free &= se3.angle_rad(se3.inverse(turns) @ poses[k]) > _APART_RAD

@@ -57,13 +57,13 @@ class Motion:
         return Motion(self.T_cam_obj @ T_old_new, self.time_s, self.velocity)
 
 
-def motion_weight(T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray]) -> np.ndarray | None:
-    """(H,) factors of poses' support by their distance from the nearest of the priors; None without priors.
+def motion_weight(T_cam_obj: Sequence[np.ndarray], priors: Sequence[np.ndarray]) -> np.ndarray:
+    """(H,) factors of poses' support by their distance from the nearest of the priors; 1 without priors.
 
     1 on a prior, 1/2 at ``MOTION_DEG`` or ``MOTION_M`` from it: heavy tails, because objects may be pushed at any time.
     """
     if not len(priors) or not len(T_cam_obj):
-        return None
+        return np.ones(len(T_cam_obj))
     off = se3.inverse(np.stack(priors))[:, None] @ np.stack(T_cam_obj)[None]
     turned = np.degrees(se3.angle_rad(off)) / MOTION_DEG
     moved = np.linalg.norm(np.stack(priors)[:, None, :3, 3] - np.stack(T_cam_obj)[None, :, :3, 3], axis=-1)

@@ -42,6 +42,8 @@ _CLEAR_OUTLINE = 0.3
 MAPPED = 0.1
 #: The reason of a pose that is degraded although nothing contradicts it.
 _UNCONSTRAINED = "rotation not constrained by shape or texture"
+#: A keypoint that has agreed with so many poses has its whole vote.
+_WHOLE_VOTE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,10 +215,21 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         few = max((c.hypothesis.support for c in candidates), default=0) < self.config.lifecycle.return_inliers
         if few and any((c.sighting or 0.0) > 0 for c in candidates):
             return max(candidates, key=lambda c: c.sighting or 0.0), "most of the surface shows"
-        weight = None
+        weight = np.ones(len(candidates))
         if "motion_weight" in self.on:
-            weight = motion_weight([c.T_cam_obj for c in candidates], list(known.life.motion_priors().values()))
+            poses, priors = [c.T_cam_obj for c in candidates], list(known.life.motion_priors().values())
+            weight = motion_weight(poses, priors)
+        if "votes" in self.on:
+            weight = weight * self._votes(known, candidates)
         return self.select(obs, known, candidates, weight)
+
+    def _votes(self, known: OurKnown, candidates: list[Proposal]) -> np.ndarray:
+        """(H,) mean vote, up to 1, of the points that agree with each candidate: it grows with what they agreed with.
+
+        New points on a reflection that stands still are many, and contradict those that have moved with the object.
+        """
+        vote = (1 + np.minimum(known.map.agreed, _WHOLE_VOTE)) / (1 + _WHOLE_VOTE)
+        return np.array([vote[c.hypothesis.inliers].mean() if c.hypothesis.support else 0.0 for c in candidates])
 
     def _look_again(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> list[Proposal]:
         """Candidates for a return, with how much of the surface shows in the image under each."""

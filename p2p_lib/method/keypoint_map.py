@@ -122,6 +122,11 @@ class KeypointMap:
         self.p_obj[rows], self.promoted[rows], self._age[rows] = centre[tight], True, 0
         return self.keys[rows]
 
+    @property
+    def agreed(self) -> np.ndarray:
+        """(N,) how many registrations each keypoint took part in and agreed with; 0 for pending points."""
+        return self._agreed
+
     def count(self, used: np.ndarray, agreed: np.ndarray) -> None:
         """Remember which points (N,) bool took part in a registration and which agreed with its pose."""
         self._agreed += used & agreed

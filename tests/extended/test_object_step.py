@@ -283,6 +283,21 @@ def test_what_moved_evenly_is_expected_to_go_on():
     assert lump.off(turned(3))[0] < 1
 
 
+@pytest.mark.parametrize("counted", [True, False])
+def test_keypoints_that_agreed_with_many_poses_outvote_more_new_ones(counted):
+    on = "all but motion_weight" + ", votes" * (not counted)
+    lump = begun(method__mechanisms=on, **NO_SURFACE)
+    obs = lump.observed(turned(3))
+    new = visible_first(int(0.65 * obs.seen.sum()))(obs.tracks) & obs.seen
+    old = obs.seen & ~new
+    for _ in range(3):
+        lump.tracker.map.count(old, old)
+    jump = se3.transform(turned(33), lump.p_model[obs.tracks.ids])
+    lump.steps.append(lump.tracker.step(replace(obs, p_cam=np.where(new[:, None], jump, obs.p_cam))))
+    assert new.sum() > old.sum() > 5, "more agree on the jump"
+    assert (lump.off(turned(3))[0] < 1) == counted
+
+
 def test_last_poses_compete_with_what_samples_find():
     lump = settled(begun(**NO_SURFACE), [1, 2])
     obs = lump.observed(turned(3))
