@@ -175,7 +175,7 @@ def _without_map(run: Path) -> list[str]:
 )
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.click import invite
-    from p2p_lib.apps.live import LiveCount, click_first, json_line, text_line, track_live
+    from p2p_lib.apps.live import LiveCount, click_first, json_line, segmenter_of, text_line, track_live
     from p2p_lib.apps.live_click import LiveClicker
     from p2p_lib.apps.live_words import Words, outlet
     from p2p_lib.core.voxels import check_device
@@ -185,6 +185,7 @@ def _live(a: argparse.Namespace) -> None:
 
     options, count, first = _asked(a), LiveCount(), None
     check_device(options.config().device)  # what does not fit is said before the camera starts
+    segmenter_of(options)
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
     keep["say"] = warn

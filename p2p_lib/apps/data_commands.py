@@ -197,18 +197,23 @@ def _config(a: argparse.Namespace) -> None:
     from p2p_lib.core import config as configuration
     from p2p_lib.extended.default import MECHANISMS, chosen
 
-    config = RunOptions.of_arguments(a).config()
+    options = RunOptions.of_arguments(a)
+    config, other = options.config(), "default" if options.preset == "paper" else "paper"
     rows, on = configuration.parameters(config, a.only), chosen(config)
     if a.diff:
-        paper = {key: left for key, (left, _) in configuration.diff().items()}
-        rows = [{"key": r["key"], "paper": paper[r["key"]], **r} for r in rows if r["key"] in paper]
+        others = {row["key"]: row for row in configuration.parameters(configuration.preset(other))}
+        rows = [row for row in rows if row["key"] in configuration.diff()]
+        rows = [
+            {"key": r["key"], other: (of := others[r["key"]])["value"], f"{other}_source": of["source"], **r}
+            for r in rows
+        ]
     if a.json:
         print(json.dumps(rows))
         return
     for row in rows:
         value = f"{row['value']} {row['unit']}".strip()
-        value += f" (paper: {row['paper']})" if a.diff else ""
-        print(f"{row['key']} = {value}\n    {row['meaning']} [{row['source']}]")
+        value += f" [{row['source']}], preset {other}: {row[other]} [{row[f'{other}_source']}]" if a.diff else ""
+        print(f"{row['key']} = {value}\n    {row['meaning']}" + f" [{row['source']}]" * (not a.diff))
         for name, does in MECHANISMS.items() if row["key"] == "method.mechanisms" else ():
             print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
     whose = "paper (its text), release (the authors' configuration) or ours"

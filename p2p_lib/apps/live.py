@@ -7,6 +7,7 @@ and counted.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -100,22 +101,21 @@ def track_live(
     """
     options, count = options or RunOptions(), count or LiveCount()
     prompts = sorted(prompts, key=lambda p: p.frame)
-    asked = replace(options, prompts=prompts, masks=options.masks or (DEFAULT_SEGMENTER if words else None))
-    config, masks = options.config(), asked.mask_source()
-    if masks.name != "clicks":
-        raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
+    if not (prompts or words or options.memory):
+        raise BadInput("prompts", "none", "what to follow: clicks, boxes or masks of objects, memories, or words")
+    config, segmenter = options.config(), segmenter_of(options)
     if options.stop is not None and options.stop < 1:
         raise BadInput("stop", options.stop, "the number of an image from 1", "Leave it out to end with Ctrl-C.")
     if backlog < 0:
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
     config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     memories = load_memories(options.memory or ())
-    method = Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter)
+    method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
     warm_up(say)
     recall(method, memories, options.frozen)
     named = options.tracker if isinstance(options.tracker, str) else ""
-    if named.startswith("builtin") and masks.segmenter in (DEFAULT_SEGMENTER, "sam2"):
-        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, masks.segmenter))
+    if named.startswith("builtin") and segmenter in (DEFAULT_SEGMENTER, "sam2"):
+        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter))
     every_prompt = list(prompts)
     with ExitStack() as kept:
         listeners: list[Listener] = []
@@ -158,16 +158,32 @@ def track_live(
     return count
 
 
+def segmenter_of(options: RunOptions) -> Any:
+    """The segmenter that ``masks`` names, the built-in one without it; :class:`BadInput` for other sources of masks."""
+    masks = replace(options, masks=options.masks or DEFAULT_SEGMENTER).mask_source()
+    if masks.name != "clicks":
+        raise BadInput("masks", repr(options.masks), f"the name of a segmenter: {', '.join(SEGMENTERS)}")
+    return masks.segmenter
+
+
 def _warm_up(method: Point2Pose) -> None:
-    """Load, and fill on made-up images, what the first of a camera would wait for, and later ones be dropped."""
+    """Load, and fill on made-up images, what the first of a camera would wait for, and later ones be dropped.
+
+    What becomes of the made-up object is nothing that a log should have.
+    """
     h, w = method.camera.height, method.camera.width
     print_ = np.kron(np.random.default_rng(0).integers(0, 255, (h // 8, w // 8, 3)), np.ones((8, 8, 1)))
     rgb, depth_m = np.full((h, w, 3), 90, np.uint8), np.full((h, w), 1.0, np.float32)
     part = np.s_[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3]
     rgb[part], depth_m[part] = print_[part], 0.6
-    method.add_object("made up", clicks=[[w / 2, h / 2]])
-    for k in range(_WARM_FRAMES):
-        method.step(Frame(k, k / 30, np.roll(rgb, 2 * k, 1), np.roll(depth_m, 2 * k, 1)))
+    log = logging.getLogger("p2p_lib")
+    was, log.disabled = log.disabled, True
+    try:
+        method.add_object("made up", clicks=[[w / 2, h / 2]])
+        for k in range(_WARM_FRAMES):
+            method.step(Frame(k, k / 30, np.roll(rgb, 2 * k, 1), np.roll(depth_m, 2 * k, 1)))
+    finally:
+        log.disabled = was
 
 
 Listener = Callable[[Frame, dict[str, PoseEstimate]], object]

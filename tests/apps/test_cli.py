@@ -548,6 +548,8 @@ def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
     assert cli.main(["config", "--diff", "--json"]) == 0
     differ = {row["key"]: (row["paper"], row["value"]) for row in json.loads(capsys.readouterr().out)}
     assert differ == diff()
+    assert cli.main(["config", "--diff", "registration.iterations", "--preset", "paper"]) == 0
+    assert "iterations = 100 [release], preset default: 400 [ours]\n" in capsys.readouterr().out
     assert cli.main(["config", "tsdf", "--set", "tsdf.voxel_m=0.007"]) == 0
     out = capsys.readouterr().out
     assert "tsdf.voxel_m = 0.007 m\n    A voxel has this edge. [ours]" in out and "registration." not in out

@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import queue
 import re
 import shutil
@@ -397,6 +398,10 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
         (["--camera", "realsense", "--rate", "15"], "rate: got 15 with realsense"),
         (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file"),
         (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--masks", "sam9"], "sam9"),
+        (
+            ["--camera", "folder:{folder}", "--masks", "dataset"],
+            "masks: got 'dataset', expected the name of a segmenter",
+        ),
     ],
 )
 def test_refusals_are_one_line(words, message, folder, tmp_path, capsys):
@@ -425,9 +430,16 @@ def test_realsense_is_named_by_open_camera(monkeypatch):
         open_camera("realsense")
 
 
-def test_what_is_tracked_before_the_camera_starts_uses_all_that_its_frames_will():
+def test_who_follows_nothing_is_told_so(folder):
+    with pytest.raises(BadInput, match="prompts: got none, expected what to follow"):
+        track_live(FolderCamera(open_sequence(folder), 500), (), print)
+
+
+def test_what_is_tracked_before_the_camera_starts_uses_all_that_its_frames_will(caplog):
     method = Point2Pose(Camera(300, 300, 159.5, 119.5, 320, 240))
-    _warm_up(method)
+    with caplog.at_level("INFO", "p2p_lib"):
+        _warm_up(method)
+    assert not caplog.records and not logging.getLogger("p2p_lib").disabled
     assert method.objects["made up"].life.has_pose and method.masks["made up"].any()
     used = {"tracking", "segmentation", "observation", "registration", "refinement", "selection", "map"}
     assert used <= set(method.stopwatch.last_ms)
