@@ -28,6 +28,7 @@ class KeypointMap:
     p_obj       (N, 3) object frame, metres
     promoted    (N,) bool
     confidence  (N,) of the pose that placed each
+    agreed      (N,) how many registrations each keypoint took part in and agreed with; 0 for pending points
     """
 
     def __init__(self, config: KeypointMapConfig):
@@ -37,7 +38,7 @@ class KeypointMap:
         self.promoted = np.zeros(0, bool)
         self.confidence = np.zeros(0)
         self._streak, self._age = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._agreed, self._disagreed = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self.agreed, self._disagreed = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._in_object, self._in_camera = np.zeros((0, _HISTORY, 3)), np.zeros((0, _HISTORY, 3))
         self._observations = np.zeros(0, np.int64)
 
@@ -122,14 +123,9 @@ class KeypointMap:
         self.p_obj[rows], self.promoted[rows], self._age[rows] = centre[tight], True, 0
         return self.keys[rows]
 
-    @property
-    def agreed(self) -> np.ndarray:
-        """(N,) how many registrations each keypoint took part in and agreed with; 0 for pending points."""
-        return self._agreed
-
     def count(self, used: np.ndarray, agreed: np.ndarray) -> None:
         """Remember which points (N,) bool took part in a registration and which agreed with its pose."""
-        self._agreed += used & agreed
+        self.agreed += used & agreed
         self._disagreed += used & ~agreed
 
     def move(self, keys: np.ndarray, p_obj: np.ndarray) -> None:
@@ -146,12 +142,12 @@ class KeypointMap:
         """
         cfg = self.config
         stale = ~self.promoted & (self._age > cfg.pending_ttl)
-        seen = self._agreed + self._disagreed
-        wrong = self.promoted & (seen >= _RETIRE_AFTER) & (self._agreed < _RETIRE_SHARE * seen)
+        seen = self.agreed + self._disagreed
+        wrong = self.promoted & (seen >= _RETIRE_AFTER) & (self.agreed < _RETIRE_SHARE * seen)
         most = cfg.max_points or len(self)
         gone = stale | (wrong & (cfg.max_points > 0))
         kept = np.flatnonzero(self.promoted & ~gone)
-        usefulness = (self._agreed[kept] + 1) / (self._age[kept] + 1)
+        usefulness = (self.agreed[kept] + 1) / (self._age[kept] + 1)
         gone[kept[np.argsort(usefulness, kind="stable")[: max(len(kept) - most, 0)]]] = True
         removed, ids = self.keys[gone], self.ids[gone]
         for name in self._columns():
