@@ -201,11 +201,14 @@ def _config(a: argparse.Namespace) -> None:
     config, other = options.config(), "default" if options.preset == "paper" else "paper"
     rows, on = configuration.parameters(config, a.only), chosen(config)
     if a.diff:
-        others = {row["key"]: row for row in configuration.parameters(configuration.preset(other))}
-        rows = [row for row in rows if row["key"] in configuration.diff()]
+        differ = configuration.diff()
+        others = {
+            row["key"]: row for row in configuration.parameters(configuration.preset(other)) if row["key"] in differ
+        }
         rows = [
-            {"key": r["key"], other: (of := others[r["key"]])["value"], f"{other}_source": of["source"], **r}
-            for r in rows
+            {"key": key, other: of["value"], f"{other}_source": of["source"], **row}
+            for row in rows
+            if (of := others.get(key := row["key"]))
         ]
     if a.json:
         print(json.dumps(rows))

@@ -398,10 +398,6 @@ def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeyp
         (["--camera", "realsense", "--rate", "15"], "rate: got 15 with realsense"),
         (["--camera", "folder:{folder}", "--prompts", "{folder}/none.json"], "none.json: no such file"),
         (["--camera", "folder:{folder}", "--prompts", "{prompts}", "--masks", "sam9"], "sam9"),
-        (
-            ["--camera", "folder:{folder}", "--masks", "dataset"],
-            "masks: got 'dataset', expected the name of a segmenter",
-        ),
     ],
 )
 def test_refusals_are_one_line(words, message, folder, tmp_path, capsys):
@@ -428,6 +424,12 @@ def test_realsense_is_named_by_open_camera(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(MissingBackend, match=r"pyrealsense2 cannot be loaded .*pip install .p2p_lib"):
         open_camera("realsense")
+
+
+def test_masks_that_no_camera_has_are_refused_before_anybody_clicks(folder, capsys, monkeypatch):
+    monkeypatch.setattr("p2p_lib.apps.live.click_first", lambda *_: pytest.fail("clicks are asked for"))
+    assert cli.main(["live", "--camera", f"folder:{folder}", "--masks", "dataset", "--no-browser"]) == 2
+    assert capsys.readouterr().err.startswith("p2p live: masks: got 'dataset', expected the name of a segmenter")
 
 
 def test_who_follows_nothing_is_told_so(folder):
