@@ -176,6 +176,18 @@ def test_every_module_imports_without_torch_open3d_and_plots():
     assert ran.stdout.splitlines()[-1:] == ["LOADED"], ran.stdout[-500:] + ran.stderr[-500:]
 
 
+def test_what_compares_equal_is_sorted_alike_on_every_processor():
+    """NumPy's default order of equal values depends on the processor's instructions, and poses on the order."""
+    unstable = [
+        f"{path.relative_to(PROJECT)}:{node.lineno}"
+        for path in sources()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in ("argsort", "argpartition")
+        if not any(word.arg == "kind" and ast.unparse(word.value) == "'stable'" for word in node.keywords)
+    ]
+    assert not unstable, "say kind='stable'"
+
+
 def test_files_tell_nothing_of_a_machine_or_registry():
     told = []
     for path in tracked_files():

@@ -109,6 +109,15 @@ def test_a_box_around_too_much_is_doubted_on_the_page_and_by_a_check(before, tmp
                 assert any("times as long as before" in text for text in texts) == many
 
 
+def test_the_page_compares_a_correction_with_the_run_before_not_with_the_mask_that_is_wrong(before, tmp_path):
+    sequence, start, was = before
+    wrong = np.zeros((480, 640), bool)
+    wrong[250:470, 20:620] = True
+    with Clicker(sequence, tmp_path / "prompts.json", run=was) as clicker:
+        _, doubts = clicker.made([Prompt(start.name, AT, box_px=(20, 250, 620, 470))], {start.name: wrong})
+    assert any("times as long as before" in text for text in doubts)
+
+
 def test_a_mask_that_says_hidden_is_no_trouble_to_a_check(before):
     """An empty mask in a later frame says that the object is not in view: it has no length."""
     _, start, _ = before
