@@ -209,7 +209,8 @@ def tried(
         def both(features: Features = features) -> list[tuple[np.ndarray, list[np.ndarray]]]:
             return [features(images[k], frames[k].rgb, (first, around)[k]) for k in range(2)]
 
-        T, agree = motion(*times[kind].run(both), images, ratio)
+        then, now = times[kind].run(both)
+        T, agree = motion(then, now, images, ratio)
         found[kind] = right(T, T_now @ se3.inverse(T_then), T_then[:3, 3]), agree
     return found
 

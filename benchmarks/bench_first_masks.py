@@ -88,7 +88,8 @@ class Start:
         features, nothing, found = network.features(self.frame.rgb), np.zeros(self.frame.shape, bool), {}
         for prompt in self.prompts:
             others = [other.points_px for other in self.prompts if other is not prompt]
-            question = Question.of_prompt(prompt, nothing, np.concatenate([np.zeros((0, 2)), *others]))
+            beside = np.concatenate([np.zeros((0, 2)), *others])
+            question = Question.of_prompt(prompt, nothing, beside, corrects=False)
             mask = question.answer(network.candidates(features, question.prompt), features)
             if mask is not None:
                 found[prompt.name] = mask

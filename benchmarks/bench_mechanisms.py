@@ -142,9 +142,11 @@ def score(sequence: str, tracked: Path) -> dict[str, float]:
     run, rows = np.load(tracked), []
     for name, (T_cam_model, scored, points) in known_truth(sequence).items():
         if f"{name}/T_cam_obj" in run:
-            told = [run[f"{name}/{key}"] for key in ("T_cam_obj", "confidence", "covariance")]
-            at = np.flatnonzero(scored[: len(told[0])])
-            rows.append(score_object(*(each[at] for each in told), T_cam_model[at], points))
+            T_cam_obj, confidence, covariance = (
+                run[f"{name}/{key}"] for key in ("T_cam_obj", "confidence", "covariance")
+            )
+            at = np.flatnonzero(scored[: len(T_cam_obj)])
+            rows.append(score_object(T_cam_obj[at], confidence[at], covariance[at], T_cam_model[at], points))
     table = pd.DataFrame(rows, columns=[*MEANS, *SUMS])
     return table[MEANS].mean().to_dict() | table[SUMS].sum().to_dict() | {"frame_ms": float(run["frame_ms"].mean())}
 
@@ -195,7 +197,8 @@ def main() -> None:
     parser.add_argument("--without", default="", metavar="NAME", help="with --track: leave out this mechanism")
     asked = parser.parse_args()
     if asked.track:
-        return track(*asked.sequences, asked.clicks, asked.stop, asked.without, asked.out)
+        (sequence,) = asked.sequences
+        return track(sequence, asked.clicks, asked.stop, asked.without, asked.out)
     asked.out.mkdir(parents=True, exist_ok=True)
     log = asked.out / "runs.jsonl"
     runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []

@@ -41,7 +41,7 @@ class Peer:
     def __init__(self, camera: Camera, objects: Iterable[str], points: int = 60):
         self.camera, self.points, self.objects = camera, points, {name: Known() for name in objects}
         self.stopwatch, self.count, self.gray = Stopwatch(), 0, None
-        self.sift, self.matcher = cv2.SIFT_create(600, contrastThreshold=0.02), cv2.BFMatcher()
+        self.sift, self.matcher = cv2.SIFT.create(600, contrastThreshold=0.02), cv2.BFMatcher()
         self.rng = np.random.default_rng(0)
 
     def step(self, frame: Frame, masks: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | None]:
