@@ -54,12 +54,19 @@ def depth_trouble(frame: Frame, mask: np.ndarray | None) -> str:
     mask  (H, W) bool: the object's pixels; None where they are unknown
     """
     if not frame.depth_m.any():
-        return "the frame has no depth"
+        return "the frame has no usable depth"
+    if far := far_depth(frame):
+        return far
+    measured, pixels = (0, 0) if mask is None else (np.count_nonzero(frame.depth_m[mask]), np.count_nonzero(mask))
+    return f"{measured} of {pixels} mask pixels have depth" if measured < _HARDLY * pixels else ""
+
+
+def far_depth(frame: Frame) -> str:
+    """That depth cannot be in metres, since nothing is near, in words; "" where it may."""
     some_m = frame.sparse["depth_m"]
     if some_m.any() and (near_m := _near_and_middle_m(some_m)[0]) > _FAR_M:
         return f"the depth of the frame is {near_m:.0f} m and more: {_MILLIMETRES}"
-    measured, pixels = (0, 0) if mask is None else (np.count_nonzero(frame.depth_m[mask]), np.count_nonzero(mask))
-    return f"{measured} of {pixels} mask pixels have depth" if measured < _HARDLY * pixels else ""
+    return ""
 
 
 def _near_and_middle_m(depth_m: np.ndarray) -> tuple[float, float]:

@@ -3,8 +3,8 @@
 Look first at :mod:`~p2p_lib.extended.default`, the one list of mechanisms: deleting a line there takes one out. They
 plug in at four places:
 
-- before a frame: ``frame_guard`` checks that it is newer than the one before, and that depth and colour are of one
-  moment;
+- before a frame: ``frame_guard`` checks that it is newer than the one before, that its depth is in metres, and that
+  depth and colour are of one moment;
 - around an object: ``two_maps`` takes the place of one object's tracker, and holds two while the object shows a side
   that its map does not have;
 - around track and segment: ``reacquisition`` looks for absent objects where motion, scene, shape and colour say;

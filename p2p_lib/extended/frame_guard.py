@@ -1,4 +1,4 @@
-"""Before a frame: is it newer than the one before, and are its depth and its colour of one moment?"""
+"""Before a frame: is it newer than the one before, is its depth in metres, and is it of the moment of its colour?"""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from p2p_lib.core.depth import far_depth
 from p2p_lib.core.errors import doubt
 from p2p_lib.core.types import Frame
 
@@ -54,6 +55,9 @@ class FrameGuard:
             doubt("depth and colour", got, fix)
             remarks.append(f"depth and colour: {got}")
             changes["depth_m"] = np.zeros_like(frame.depth_m)  # not of the moment of its colour: points can wait
+        if self._newest is not None and (far := far_depth(frame)):  # such a first frame is refused
+            remarks.append(far)
+            changes["depth_m"] = np.zeros_like(frame.depth_m)
         remark = "; ".join(filter(None, remarks))
         self._newest = DoubtedFrame.of(frame, remark=remark, still=still, **changes) if remark or still else frame
         return self._newest

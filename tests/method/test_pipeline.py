@@ -237,8 +237,11 @@ def test_a_ctrl_c_that_a_library_takes_for_itself_is_heard(monkeypatch):
 @pytest.mark.parametrize(
     ("scale", "says"),
     [
-        (0, r"the frame has no depth"),
-        (1000, r"the depth of the frame is \d\d\d m and more: is it in millimetres\?"),
+        (0, r"the frame has no usable depth"),
+        (
+            1000,
+            r"(the frame has no usable depth; )?the depth of the frame is \d\d\d m and more: is it in millimetres\?",
+        ),
         (None, r"0 of \d+ mask pixels have depth"),
     ],
 )
@@ -248,6 +251,18 @@ def test_an_estimate_says_what_is_wrong_with_the_depth_of_its_frame(name, scale,
     *_, last = track([*before, (replace(frame, depth_m=depth_m), masks)], config=quick(name))
     assert last["left"].T_cam_obj is None and re.fullmatch(says, last["left"].reason)
     assert (last["right"].reason == "") == (scale is None), "the other one has its depth"
+
+
+def test_a_frame_in_millimetres_counts_as_one_without_depth():
+    """For tracks and masks, too: what comes after it is the same."""
+    poses = []
+    for scale in (0, 1000):
+        frames = [
+            (replace(f, depth_m=scale * f.depth_m) if k == 4 else f, masks) for k, (f, masks) in enumerate(film())
+        ]
+        poses.append([estimate["left"].T_cam_obj for estimate in track(frames[:8], names=("left",), config=quick())])
+    assert all(np.array_equal(a, b) for a, b in zip(*poses, strict=True) if a is not None)
+    assert [pose is None for pose in poses[0]] == [pose is None for pose in poses[1]]
 
 
 def test_frames_of_one_time_say_so_once():
