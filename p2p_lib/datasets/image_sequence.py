@@ -34,8 +34,9 @@ def camera_for(rgb: Sequence[Path], K: np.ndarray, name: str) -> Camera:
 
 @dataclass(frozen=True, eq=False)
 class ImageSequence:
-    """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files, one ``rgb`` and one ``depth`` a frame.
+    """A :class:`~p2p_lib.datasets.sequence.Sequence` of image files, one ``rgb`` and one ``depth`` a frame, in order.
 
+    times_s        (N,) seconds, increasing
     depth_invalid  raw depth value that means "no measurement" besides 0
     read_depth     reads a depth file: (H, W) in the file's unit, of which depth_scale is metres
     mask_files     what :meth:`masks` gives; ``own_masks`` the dataset's own, which scoring counts
@@ -59,6 +60,18 @@ class ImageSequence:
     read_truth: Callable[[], dict[str, ObjectTruth]] = dict
     model_places: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
     scene_seed: int | None = None
+
+    def __post_init__(self) -> None:
+        for what, files in (("rgb", self.rgb), ("depth", self.depth)):
+            each = files if isinstance(files, tuple | list) else [files]
+            odd = next((file for file in each if not isinstance(file, Path)), None)
+            if odd is not None:
+                fix = "tuple(sorted(folder.glob(PATTERN))) is one."
+                raise BadInput(f"{self.path}: {what}", type(odd).__name__, "a tuple of Paths, one a frame", fix)
+        if not len(self.rgb) == len(self.depth) == len(self.times_s) > 0:
+            got = f"{len(self.rgb)} colour images, {len(self.depth)} depth images and {len(self.times_s)} times"
+            fix = "Look at the patterns by which the loader finds its files."
+            raise BadInput(str(self.path), got, "one of each a frame, and a frame at least", fix)
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -103,6 +116,15 @@ class ImageSequence:
         self._check_index(i)
         return self.own_masks.count(i) if self.own_masks else None
 
+    def check_camera(self) -> None:
+        """:class:`BadInput` where the camera is not as large as the first image that can be read."""
+        height, width = images.first_readable(self.rgb, images.read_rgb).shape[:2]
+        if self.shape != (height, width):
+            swapped = self.shape == (width, height)
+            fix = "Width and height are swapped: width comes first, in an array's shape height does." if swapped else ""
+            got = f"{self.camera.width}x{self.camera.height} pixels"
+            raise BadInput(f"{self.path}: camera", got, f"{width}x{height}, as large as the colour images", fix)
+
     def _check_index(self, i: int) -> None:
         if not 0 <= i < len(self):
             raise BadInput(f"{self.name}: frame", i, f"a number from 0 to {len(self) - 1}")
@@ -121,6 +143,7 @@ class ImageSequence:
         """
 
         def find(where: Path) -> MaskFiles:
+            self.check_camera()  # otherwise the masks would be blamed
             return find_masks(where, self.rgb, self.shape, objects, some_frames or where == given)
 
         given = None if asked is None else self.path / asked

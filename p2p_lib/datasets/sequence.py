@@ -168,9 +168,10 @@ def open_sequence(
     format = format or recognise(folder)
     with gaps_allowed(gaps):
         read = (read_folder or _loader(format))(folder, masks)
-    if not isinstance(read, ImageSequence):
-        what = f"format {format}: what load(folder, masks) gives"
-        raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
+        if not isinstance(read, ImageSequence):
+            what = f"format {format}: what load(folder, masks) gives"
+            raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
+        read.check_camera()
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale, scene_seed=seed)
 
 

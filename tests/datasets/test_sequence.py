@@ -3,15 +3,18 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from p2p_lib.core import se3
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import PoseEstimate, Status
+from p2p_lib.datasets.image_sequence import ImageSequence
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
@@ -287,6 +290,51 @@ def test_the_seed_of_a_run_is_no_seed_of_its_scene(ycbmultitrack, monkeypatch, t
         info = load_run(run(sequence, tmp_path / name, seed=5, **options).path).info
         assert (info["seed"], info["scene_seed"], info["sequence"]) == (5, int(name), sequence)
     assert set(asked[:1]) == {0} and asked[-1] == 3 and 5 not in asked
+
+
+OWN = {
+    "as it should be": {},
+    "lists": {"rgb": list, "depth": list},
+    "fewer depth images": {
+        "depth": lambda files: files[:3],
+        "said": "own: got 4 colour images, 3 depth images and 4 times, expected one of each a.*Look at the patterns",
+    },
+    "more depth images": {"depth": lambda files: files * 2, "said": "own: got 4 colour images, 8 depth images and 4"},
+    "fewer times": {"times": lambda s: s[1:], "said": "own: got 4 colour images, 4 depth images and 3 times"},
+    "nothing matches": {
+        **dict.fromkeys(("rgb", "depth", "times"), lambda of: of[:0]),
+        "said": "own: got 0 colour images, 0 depth images and 0 times, expected one of each a frame, and a frame",
+    },
+    "an iterator": {"rgb": iter, "said": r"own: rgb: got tuple_iterator, expected a tuple of Paths.*tuple\(sorted\("},
+    "texts": {"depth": lambda files: tuple(map(str, files)), "said": "own: depth: got str, expected a tuple of Paths"},
+    "swapped": {
+        "size": (H, W),
+        "said": "own: camera: got 32x48 pixels, expected 48x32, as .* images. Width and height",
+    },
+    "another size": {"size": (96, 64), "said": "own: camera: got 96x64 pixels, expected 48x32, as large as the colour"},
+}
+
+
+@pytest.mark.parametrize("masks", [True, False], ids=["with masks", "without"])
+@pytest.mark.parametrize("case", OWN)
+def test_what_a_loader_of_somebody_elses_puts_together_is_checked(tmp_path, monkeypatch, case, masks):
+    """Whether it has masks or not: a mistake in the camera is not blamed on them."""
+    write_pictures(tmp_path / "own")
+    write_image(tmp_path / "own/masks/0000.png", disc(0))
+    how = {"rgb": tuple, "depth": tuple, "times": np.array, "size": (W, H), "said": ""} | OWN[case]
+
+    def load(folder, asked):
+        rgb, depth = (how[part](tuple(sorted((folder / part).iterdir()))) for part in ("rgb", "depth"))
+        made = ImageSequence(folder, rgb, depth, Camera.from_K(K, *how["size"]), how["times"](np.arange(N) / 30))
+        return made.with_masks(asked, [folder / "masks"], some_frames=True) if masks else made
+
+    monkeypatch.setitem(sys.modules, "their_layout", SimpleNamespace(load=load))
+    if not how["said"]:
+        sequence = open_sequence(tmp_path / "own", format="their_layout:load")
+        assert sequence.frame(3).rgb[0, 0, 2] == 130 and (sequence.masks(0) is not None) == masks
+        return
+    with pytest.raises(BadInput, match=how["said"]):
+        open_sequence(tmp_path / "own", format="their_layout:load")
 
 
 def test_opening_is_light():
