@@ -39,9 +39,9 @@ SEGMENTERS = {
     "sam2_video_base_plus": "p2p_lib.segmenters.sam2_video:load_base_plus",
     "sam2_video_large": "p2p_lib.segmenters.sam2_video:load_large",
 }
-#: What a class of somebody else has at least (:mod:`p2p_lib.core.interfaces`); ``name`` may be made by its __init__.
+#: What a part has besides its name (:mod:`p2p_lib.core.interfaces`).
 PROMISES = {
-    "tracker": ("start", "add", "track", "drop", "reject", "suggest"),
+    "tracker": ("latency_frames", "start", "add", "track", "drop", "reject", "suggest"),
     "detector": ("detect",),
     "segmenter": ("names", "segment", "remove"),
 }
@@ -60,22 +60,18 @@ def make_tracker(
 
     A name may be ``package.module:Class``. :class:`BadInput` lists the known names where this one is unknown.
     """
-    made = _find("tracker", tracker, TRACKERS)(config, rng) if isinstance(tracker, str) else _own("tracker", tracker)
+    made = _made("tracker", tracker, TRACKERS, config, rng)
     return load(_SHORT_HORIZON)(made, config.forget_after) if config.forget_after else made
 
 
 def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
     """The detector of this name, or the one given; :class:`BadInput` lists the known names."""
-    return (
-        _find("detector", detector, DETECTORS)(config, rng) if isinstance(detector, str) else _own("detector", detector)
-    )
+    return _made("detector", detector, DETECTORS, config, rng)
 
 
 def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: SegmentationConfig) -> Segmenter:
     """The segmenter of this name, or the one given; :class:`BadInput` lists the known names."""
-    if not isinstance(segmenter, str):
-        return _own("segmenter", segmenter)
-    return _find("segmenter", segmenter, SEGMENTERS)(camera, config)
+    return _made("segmenter", segmenter, SEGMENTERS, camera, config)
 
 
 def is_segmenter(name: str) -> bool:
@@ -88,11 +84,9 @@ def make_recogniser(camera: Camera) -> Any:
     return load(_RECOGNISER)(camera)
 
 
-def _find(kind: str, name: str, known: dict[str, str]) -> Any:
-    return find(kind, ALIASES.get(name, name), known, PROMISES[kind])
-
-
-def _own(kind: str, part: T) -> T:
-    """A part that was given, which has what the method asks of its kind."""
-    check_part(kind, part, PROMISES[kind])
-    return part
+def _made(kind: str, part: str | T, known: dict[str, str], *made_of: Any) -> T:
+    """The part of this name, or the one given, which has what the method asks of its kind."""
+    name = ALIASES.get(part, part) if isinstance(part, str) else ""
+    made = find(kind, name, known)(*made_of) if isinstance(part, str) else part
+    check_part(kind, made, PROMISES[kind], name)
+    return made

@@ -6,9 +6,10 @@ A package offers parts as entry points of the groups ``p2p_lib.trackers``, ``p2p
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
@@ -19,6 +20,14 @@ from p2p_lib.core.errors import BadInput, MissingBackend, did_you_mean, in_a_lin
 
 #: What users call a kind where that is another word: --format.
 _SAID = {"dataset": "format"}
+#: What a part of each kind is called with.
+CALLED_WITH = {
+    "tracker": ("config", "rng"),
+    "detector": ("config", "rng"),
+    "segmenter": ("camera", "config"),
+    "dataset": ("folder", "masks"),
+    "camera": (),
+}
 _WHERE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
@@ -43,25 +52,23 @@ def knows(kind: str, name: str, known: Iterable[str]) -> bool:
     return name in known or is_place(name) or name in offered(kind)
 
 
-def find(kind: str, name: str, known: Mapping[str, str], has: Iterable[str] = ()) -> Any:
+def find(kind: str, name: str, known: Mapping[str, str]) -> Callable[..., Any]:
     """What a name stands for: one of ``known`` (name to place), an offered one, or what lies at a place.
 
-    has  attributes that it, not being ours, must have
-
-    :class:`BadInput` lists the names where this is none, and says what is lacking at the place that it names;
-    :class:`MissingBackend` says why it cannot be loaded.
+    :class:`BadInput` lists the names where this is none, and says what is wrong at the place that it names, also where
+    that cannot be called as its kind is (:data:`CALLED_WITH`); :class:`MissingBackend` says why it cannot be loaded.
     """
     if name in known:
         return load(known[name])
     if is_place(name):
         with _working_folder_first():
-            return _checked(kind, name, name, has)
+            return _theirs(kind, name, name)
     points = offered(kind)
     if name not in points:
         names = [*known, *points]
         expected = f"one of {', '.join(names)}, or your own as package.module:Class"
         raise BadInput(_SAID.get(kind, kind), repr(name), expected, did_you_mean(name, names))
-    return _checked(kind, name, points[name].value, has)
+    return _theirs(kind, name, points[name].value)
 
 
 @contextmanager
@@ -85,32 +92,52 @@ def load(where: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def _checked(kind: str, name: str, where: str, has: Iterable[str]) -> Any:
+def _theirs(kind: str, name: str, where: str) -> Callable[..., Any]:
     """What somebody else's code brings, with what is wrong with it said in one line."""
     module, _, attribute = where.partition(":")
+    said = _SAID.get(kind, kind)
     try:
         found = import_module(module)
+    except SyntaxError as error:
+        got = f"a syntax error in {error.filename}:{error.lineno} ({error.msg})"
+        raise BadInput(f"{said} {name}", got, "a module that can be imported", "Mend that line.") from error
     except ImportError as error:
-        fix = "Is its folder on PYTHONPATH, or its package installed in this environment?"
-        raise MissingBackend(f"{kind} {name}", f"{module} cannot be imported ({in_a_line(error)})", fix) from error
+        what, fix = "cannot be imported", "Is its folder on PYTHONPATH, or its package installed in this environment?"
+        if not (isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")):
+            what = "is there, but not what it imports"
+            fix = f"Install that, or mend the import: python -c 'import {module}' shows where it is."
+        raise MissingBackend(f"{said} {name}", f"{module} {what} ({in_a_line(error)})", fix) from error
     if attribute and not hasattr(found, attribute):
         near = did_you_mean(attribute, [key for key in vars(found) if not key.startswith("_")], f"{module}:")
-        raise BadInput(_SAID.get(kind, kind), repr(name), f"something called {attribute} in {found.__name__}", near)
+        raise BadInput(said, repr(name), f"something called {attribute} in {found.__name__}", near)
     part = getattr(found, attribute) if attribute else found
-    if lacking := [key for key in has if isinstance(part, type) and not _promises(part, key)]:
-        raise BadInput(f"{kind} {name}", f"a class without {', '.join(lacking)}", f"a {kind}, see CONTRIBUTING.md")
+    call = f"{attribute}({', '.join(CALLED_WITH[kind])})"
+    if not callable(part):
+        of = type(part).__name__
+        fix = f"Did you mean {module}:{of}?" if hasattr(found, of) else ""
+        raise BadInput(f"{said} {name}", f"an instance of {of}", f"a class or a function, called as {call}", fix)
+    try:
+        signature = inspect.signature(part)
+    except ValueError:  # of compiled code nobody knows
+        return part
+    try:
+        signature.bind(*CALLED_WITH[kind])
+    except TypeError as error:
+        got = f"{attribute}{signature}, which cannot be called so ({error})"
+        raise BadInput(f"{said} {name}", got, f"{call}, see CONTRIBUTING.md") from error
     return part
 
 
-def _promises(part: type, key: str) -> bool:
-    """Whether instances have it: a method, a value of the class, or one that it annotates."""
-    return hasattr(part, key) or any(key in vars(c).get("__annotations__", {}) for c in part.__mro__)
+def check_part(kind: str, part: Any, has: Iterable[str], name: str = "") -> None:
+    """Refuse a part without a ``name``, or some of ``has``; :class:`BadInput` says what.
 
-
-def check_part(kind: str, part: object, has: Iterable[str]) -> None:
-    """Refuse what is given as a part and lacks some of ``has``; :class:`BadInput` says what."""
+    name  by which it was asked for
+    """
+    said = f"{kind} {name}".strip()
     if isinstance(part, type):
-        raise BadInput(kind, f"the class {part.__name__}", f"a {kind}: an instance, or a name")
-    if lacking := [key for key in has if not hasattr(part, key)]:
+        raise BadInput(said, f"the class {part.__name__}", f"a {kind}: an instance, or a name")
+    if lacking := [key for key in ("name", *has) if not hasattr(part, key)]:
         got = f"{type(part).__name__} without {', '.join(lacking)}"
-        raise BadInput(kind, got, f"a {kind}, see CONTRIBUTING.md")
+        raise BadInput(said, got, f"a {kind}, see CONTRIBUTING.md")
+    if not isinstance(part.name, str):
+        raise BadInput(f"{said}: name", repr(part.name), "a text")

@@ -20,7 +20,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.plugins import find, is_place
+from p2p_lib.core.plugins import check_part, find, is_place
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
 
@@ -111,17 +111,15 @@ class FolderCamera:
 class OwnCamera:
     """Somebody else's camera: what it gives is checked, and it is closed once, however often that is asked for.
 
-    Raises :class:`BadInput` for one without a name or a :class:`~p2p_lib.core.camera.Camera`.
+    Raises :class:`BadInput` for one that lacks something, or has no :class:`~p2p_lib.core.camera.Camera`.
     """
 
     def __init__(self, spec: str, own: LiveCamera):
         self._spec, self._own, self._closed, self._last = spec, own, False, -1
-        name, camera = getattr(own, "name", None), getattr(own, "camera", None)
-        if not isinstance(name, str):
-            raise BadInput(f"camera {spec}: name", repr(name), "a text")
-        if not isinstance(camera, Camera):
-            raise BadInput(f"camera {spec}: camera", type(camera).__name__, "a p2p_lib.Camera")
-        self.name, self.camera = name, camera
+        check_part("camera", own, ("camera", "read", "close"), spec)
+        if not isinstance(own.camera, Camera):
+            raise BadInput(f"camera {spec}: camera", type(own.camera).__name__, "a p2p_lib.Camera")
+        self.name, self.camera = own.name, own.camera
 
     def read(self) -> Frame | None:
         """Its next frame; :class:`BadInput` for anything else, and for an index that is not above the last one."""
@@ -153,7 +151,7 @@ def open_camera(spec: str, rate_hz: float | None = None) -> LiveCamera:
     if kind == "folder" and what:
         return FolderCamera(open_sequence(what), DEFAULT_RATE_HZ if rate_hz is None else rate_hz)
     if kind != "realsense" and is_place(spec) and rate_hz is None:
-        return OwnCamera(spec, find("camera", spec, {}, has=("read", "close"))())
+        return OwnCamera(spec, find("camera", spec, {})())
     if kind != "realsense":
         fix = f"Did you mean folder:{spec}?" if Path(spec).is_dir() else ""
         expected = "realsense, realsense:RECORDING, folder:PATH or your own as module:Class"

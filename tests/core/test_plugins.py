@@ -13,9 +13,9 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingBackend
 from p2p_lib.core.options import RunOptions
+from p2p_lib.datasets.cameras import open_camera
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.trackers.lk import LkTracker
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import write_sequence
 
@@ -37,7 +37,15 @@ class Cutter(BuiltinSegmenter):
         self.name = "cutter"
 
 class Unfinished:
+    def __init__(self, config, rng): ...
     def start(self, frame, camera=None): ...
+
+class Weighty:
+    def __init__(self, *, weights): ...
+
+def sized(config, rng, size): ...
+
+made = Mine(None)
 
 def load(folder, masks):
     return plain.load(folder, masks)
@@ -161,20 +169,55 @@ def test_what_cannot_be_had_is_said_in_one_line(theirs, sequence):
             make_tracker(name, tracking)
     with pytest.raises(BadInput, match=r"something called Mime in their_parts. Did you mean their_parts:Mine\?"):
         make_tracker("their_parts:Mime", tracking)
-    with pytest.raises(BadInput, match="Unfinished: got a class without add, track, drop, reject, suggest"):
+    unfinished = (
+        "Unfinished: got Unfinished without name, latency_frames, add, track, drop, reject, suggest, expected a"
+    )
+    with pytest.raises(BadInput, match=f"tracker their_parts:{unfinished}"):
         make_tracker("their_parts:Unfinished", tracking)
-    with pytest.raises(BadInput, match="a class without detect"):
+    with pytest.raises(BadInput, match="detector their_parts:Mine: got Mine without detect"):
         make_detector("their_parts:Mine", sampling)
-    with pytest.raises(BadInput, match="segmenter: got object without names, segment, remove"):
+    with pytest.raises(BadInput, match="segmenter: got object without name, names, segment, remove"):
         make_segmenter(object(), Camera(100, 100, 10, 10, 20, 20), preset().segmentation)
     with pytest.raises(BadInput, match="detector: got the class object, expected a detector: an instance, or a name"):
         make_detector(object, sampling)
-    with pytest.raises(BadInput, match="a class without names, segment, remove"):
+    with pytest.raises(BadInput, match="segmenter their_parts:Mine: got Mine without names, segment, remove"):
         make_segmenter("their_parts:Mine", Camera(100, 100, 10, 10, 20, 20), preset().segmentation)
     with pytest.raises(BadInput, match=r"format: got 'marks', .* or your own as package.module:Class"):
         open_sequence("nowhere", format="marks")
     with pytest.raises(BadInput, match=r"their_parts:nothing: .* gives: got NoneType, expected an ImageSequence"):
         open_sequence(sequence, format="their_parts:nothing")
+
+
+def test_every_kind_is_found_in_one_way_and_called_as_it_is_promised(theirs, sequence):
+    """What cannot be called so is said with what it takes and how it is called, before anything is read."""
+    for kind, words in plugins.CALLED_WITH.items():
+        call, said = re.escape(f"({', '.join(words)})"), "format" if kind == "dataset" else kind
+        with pytest.raises(BadInput, match=rf"{said} their_parts:made: .* instance of Mine, .* called as made{call}"):
+            plugins.find(kind, "their_parts:made", {})
+        with pytest.raises(BadInput, match=rf"{said} their_parts:sized: got sized\(config, rng, size\), .*sized{call}"):
+            plugins.find(kind, "their_parts:sized", {})
+    with pytest.raises(BadInput, match=r"Did you mean their_parts:Mine\?"):
+        make_tracker("their_parts:made", preset().tracking)
+    with pytest.raises(BadInput, match=r"got Weighty\(\*, weights\), .* expected Weighty\(config, rng\)"):
+        make_tracker("their_parts:Weighty", preset().tracking)
+    with pytest.raises(BadInput, match=r"got Unlucky\(config: .* expected Unlucky\(\)"):
+        open_camera("their_parts:Unlucky")
+    with pytest.raises(BadInput, match=r"format their_parts:fail: got fail\(\), .* expected fail\(folder, masks\)"):
+        open_sequence(sequence, format="their_parts:fail")
+
+
+@pytest.mark.parametrize(
+    ("line", "error", "said"),
+    [
+        ("class Mine(:", BadInput, r"got a syntax error in \S+their_odd_parts.py:1 \(.*Mend that line"),
+        ("import no_such", MissingBackend, r"is there, but not what it imports \(No module named 'no_such'\). Install"),
+        ("from re import no", MissingBackend, r"is there, but not what it imports \(cannot import name 'no' from 're'"),
+    ],
+)
+def test_a_module_that_does_not_load_says_what_of_it(theirs, line, error, said):
+    (theirs / "their_odd_parts.py").write_text(line)
+    with pytest.raises(error, match=rf"tracker their_odd_parts:Mine: .*{said}"):
+        make_tracker("their_odd_parts:Mine", preset().tracking)
 
 
 @pytest.mark.parametrize(
@@ -218,4 +261,3 @@ def test_a_mistake_of_ours_is_none_of_theirs(theirs, sequence, tmp_path, monkeyp
 def test_a_folder_of_masks_is_no_segmenter(theirs):
     assert RunOptions(masks="drawn").mask_source().folder == "drawn"
     assert RunOptions(masks="their_parts:Cutter").mask_source().segmenter == "their_parts:Cutter"
-    assert issubclass(type(make_tracker("somebodys", preset().tracking)), LkTracker)
