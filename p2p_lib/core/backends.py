@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.checked_tracker import CheckedTracker
 from p2p_lib.core.config import SamplingConfig, SegmentationConfig, TrackingConfig
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.plugins import check_part, find, knows, load
@@ -56,11 +57,11 @@ ALIASES = {"embedded": "builtin"}
 def make_tracker(
     tracker: str | PointTracker, config: TrackingConfig, rng: np.random.Generator | None = None
 ) -> PointTracker:
-    """The tracker of this name, or the one given, with the memory that the configuration grants it.
+    """The tracker of this name, or the one given, checked as it answers, with the memory that the configuration grants.
 
     A name may be ``package.module:Class``. :class:`BadInput` lists the known names where this one is unknown.
     """
-    made = _made("tracker", tracker, TRACKERS, config, rng)
+    made = CheckedTracker(_made("tracker", tracker, TRACKERS, config, rng))
     return load(_SHORT_HORIZON)(made, config.forget_after) if config.forget_after else made
 
 

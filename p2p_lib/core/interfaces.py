@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Rows, Tracks
 
@@ -59,21 +58,6 @@ class PointTracker(Protocol):
         frame's tracks with what it found, or None where it has nothing to add: ignoring it is allowed.
         """
         return None
-
-
-def checked_tracks(tracker: PointTracker, tracks: Tracks, frame: Frame) -> Tracks:
-    """What a tracker says of a frame; :class:`BadInput` names it where that cannot be used."""
-    who = f"tracker {tracker.name!r} ({type(tracker).__name__}), frame {frame.index}"
-    if not isinstance(tracks, Tracks):
-        raise BadInput(who, type(tracks).__name__, "Tracks(ids, uv_px, visible, uncertainty)")
-    nowhere = np.asarray(tracks.visible, bool) & ~np.isfinite(tracks.uv_px).all(1)
-    if nowhere.any():
-        at = tracks.uv_px[nowhere][0].tolist()
-        got = f"{nowhere.sum()} of {np.count_nonzero(tracks.visible)} visible points at no pixel, the first at {at}"
-        raise BadInput(who, got, "finite uv_px of every visible point", "Of a point that is nowhere: visible False.")
-    if not ((tracks.uncertainty >= 0) & (tracks.uncertainty <= 1))[tracks.visible].all():
-        raise BadInput(who, f"uncertainty {tracks.uncertainty[tracks.visible].tolist()}"[:60], "numbers in [0, 1]")
-    return tracks
 
 
 @dataclass(frozen=True, eq=False)

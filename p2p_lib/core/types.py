@@ -114,8 +114,9 @@ class Tracks:
 
     def __post_init__(self) -> None:
         n = len(self.ids)
-        if self.uv_px.shape != (n, 2) or self.visible.shape != (n,) or self.uncertainty.shape != (n,):
-            got = f"uv_px {self.uv_px.shape}, visible {self.visible.shape}, uncertainty {self.uncertainty.shape}"
+        shapes = np.shape(self.uv_px), np.shape(self.visible), np.shape(self.uncertainty)
+        if shapes != ((n, 2), (n,), (n,)):
+            got = "uv_px {}, visible {}, uncertainty {}".format(*shapes)
             raise BadInput("tracks", f"{n} ids, {got}", "(N,), (N, 2), (N,), (N,)")
 
     def __len__(self) -> int:

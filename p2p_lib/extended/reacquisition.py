@@ -16,7 +16,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.image import either
-from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter, checked_tracks
+from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
@@ -115,9 +115,7 @@ class Reacquisition(Frontend):
         seen = {name: objects[name].observe(frame, masks[name], self.tracks) for name in sought}
         looked = {name: objects[name].outlook.sighted(obs) for name, obs in seen.items()}
         found = {name: sighting for name, sighting in looked.items() if sighting is not None}
-        self._suggest(
-            frame, {name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()}
-        )
+        self._suggest({name: objects[name].outlook.points_px(seen[name], at.T_cam_obj) for name, at in found.items()})
         return found
 
     def hints(self, frame: Frame, sought: Sequence[str]) -> Mapping[str, Hint]:
@@ -156,14 +154,14 @@ class Reacquisition(Frontend):
         """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
         looked = {name: self.maps[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}
-        self._suggest(frame, expected)
+        self._suggest(expected)
         return {name: self.maps[name].seen_anew(seen[name], self.tracks) for name in expected}
 
-    def _suggest(self, frame: Frame, expected_px: Mapping[str, np.ndarray]) -> None:
+    def _suggest(self, expected_px: Mapping[str, np.ndarray]) -> None:
         """Have the tracker look for points where their objects expect them, unless it answers late."""
         if self.tracker.latency_frames:
             return
         with self.stopwatch("tracking"):
             for name, uv_px in expected_px.items():
                 found = self.tracker.suggest(self.maps[name].map.ids, uv_px)
-                self.tracks = self.tracks if found is None else checked_tracks(self.tracker, found, frame)
+                self.tracks = self.tracks if found is None else found

@@ -12,7 +12,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import check_metres
 from p2p_lib.core.image import either
-from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter, checked_tracks
+from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Tracks
@@ -71,7 +71,7 @@ class Frontend:
             known = [mask for mask in masks.values() if mask is not None]
             search = either(known) if len(known) == len(masks) > 0 else None
             urgent = any(obj.awaited(masks[name]) for name, obj in self.objects.items())
-            return checked_tracks(self.tracker, self.tracker.track(frame, search, urgent), frame)
+            return self.tracker.track(frame, search, urgent)
 
     def segment(self, inputs: FrameInputs) -> None:
         """Every object's mask: the one given, else the segmenter's, which learns from those that are given."""

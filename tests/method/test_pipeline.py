@@ -285,13 +285,13 @@ def test_tracks_that_cannot_be_used_are_refused():
 
     for Lost.wrong, Lost.value, says in (
         ("uv_px", np.nan, r"3 of \d+ visible points at no pixel, the first at \[nan, nan\], expected finite uv_px"),
-        ("uncertainty", np.nan, r"uncertainty \[nan, nan, nan.*expected numbers in \[0, 1\]"),
+        ("uncertainty", np.nan, r"uncertainty nan of a visible point, expected a number in \[0, 1\]"),
     ):
         config = quick()
         method = Point2Pose(CAMERA, config, Lost(config.tracking, np.random.default_rng(0)))
         method.add_object("left")
         method.step(film()[0][0], {"left": film()[0][1]["left"]})
-        with pytest.raises(BadInput, match=rf"tracker 'builtin' \(Lost\), frame 1: got {says}"):
+        with pytest.raises(BadInput, match=rf"tracker 'builtin' \(Lost\), frame 1: track\(\): got {says}"):
             method.step(film()[1][0])
 
 

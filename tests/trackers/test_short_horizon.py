@@ -92,7 +92,7 @@ def test_rows_stay_until_dropped_and_calls_reach_the_living():
 
 def test_it_is_put_before_any_tracker_by_the_configuration_alone():
     inner = Script(np.ones((2, 1)))
-    assert make_tracker(inner, TrackingConfig()) is inner
+    assert make_tracker(inner, TrackingConfig()).name == "script"
     short = make_tracker(inner, TrackingConfig(forget_after=10))
     assert isinstance(short, ShortHorizon) and short.name == "script-sh(10)"
     assert make_tracker("lk", TrackingConfig(forget_after=3)).name == "lk-sh(3)"
