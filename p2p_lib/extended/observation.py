@@ -31,11 +31,13 @@ class OurObservation(Observation):
 
     sighting  where an absent object was found by shape and colour; None where it was not
     given     whether the caller gave the mask; else the segmenter made it
+    told      whether the caller's prompt made or corrected it
     other     the same for the object's other map; None where there is none
     """
 
     sighting: Sighting | None = None
     given: bool = True
+    told: bool = False
     other: OurObservation | None = None
 
     @cached_property

@@ -130,12 +130,10 @@ class Reacquisition(Frontend):
 
     def observe(self, inputs: FrameInputs) -> Mapping[str, OurObservation]:
         """What the frame shows of every object, after misplaced tracks are rejected and missing points looked for."""
-        seen = {
-            name: self.maps[name].observe(
-                inputs.frame, mask, self.tracks, self._sightings.get(name), inputs.masks[name] is not None
-            )
-            for name, mask in self.masks.items()
-        }
+        seen = {}
+        for name, mask in self.masks.items():
+            by_whom = inputs.masks[name] is not None, name in inputs.prompts
+            seen[name] = self.maps[name].observe(inputs.frame, mask, self.tracks, self._sightings.get(name), *by_whom)
         if "rejection" in self.on:
             self.apply(self._misplaced(seen, inputs.masks))
         return seen | self._redetect(inputs.frame, seen) if "redetection" in self.on else seen

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from p2p_lib.core import se3
+from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.gates import OUTLINE, Judgement
 from p2p_lib.extended.image_search import Sighting
@@ -38,6 +39,7 @@ _PATIENCE, _OUTGROWN = 5, 1.5
 #: turned to a side that nobody knows: a second map is begun.
 _STAYS_LOST, _IN_PLAIN_VIEW = 12, 0.4
 _STILL_GROWING = "still coming into view"
+_STAYED_LOST, _CORRECTED = "the object stayed lost in the old", "by the correction the old was of something else"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +163,11 @@ class TwoMaps:
         tracks: Tracks,
         sighting: Sighting | None = None,
         given: bool = True,
+        told: bool = False,
     ) -> OurObservation:
         """What a frame shows of the object, by its mask (H, W) bool, None where unknown, and all objects' tracks."""
         obs = self.own.observe(frame, mask, tracks)
-        ours = OurObservation(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given)
+        ours = OurObservation(obs.frame, obs.mask, obs.tracks, obs.p_cam, obs.cloud, sighting, given, told)
         return self._with_other(ours, tracks)
 
     def seen_anew(self, obs: OurObservation, tracks: Tracks) -> OurObservation:
@@ -193,6 +196,8 @@ class TwoMaps:
         if own.model.empty:
             return own.absent(obs, Verdict(False, Status.INITIALISING, _STILL_GROWING))
         self.life = self.life.at(obs.frame.time_s)
+        if obs.told and self._contradicted(obs):
+            return self._begin_anew(obs, _CORRECTED)
         best, verdict = own.find(obs)
         by_other = self._by_other(obs, best, verdict)
         if by_other is not None:
@@ -200,7 +205,7 @@ class TwoMaps:
         if best is not None and verdict.accepted:
             return self._accept(obs, best, verdict)
         if (outgrown := self._outgrown(obs)) or self._turned_over(obs):
-            return self._begin_anew(obs, keep=not outgrown)
+            return self._begin_anew(obs, _STAYED_LOST, keep=not outgrown)
         return own.absent(obs, verdict)
 
     def _accept(self, obs: OurObservation, best: Candidate, verdict: Verdict) -> ObjectStep:
@@ -240,7 +245,12 @@ class TwoMaps:
         plain = area_m2(self.observer, obs) >= _IN_PLAIN_VIEW * self.life.seen_m2
         return plain and self.policy.outline(obs) >= OUTLINE
 
-    def _begin_anew(self, obs: OurObservation, keep: bool) -> ObjectStep:
+    def _contradicted(self, obs: OurObservation) -> bool:
+        """Whether most points that the tracker sees lie outside a mask that the user corrected: the map is of them."""
+        seen = obs.tracks.uv_px[obs.tracks.visible]
+        return obs.mask is not None and bool(2 * np.count_nonzero(in_mask(seen, obs.mask)) < len(seen))
+
+    def _begin_anew(self, obs: OurObservation, why: str, keep: bool = True) -> ObjectStep:
         """Begin a new map; with ``keep`` the one so far becomes the other one, else it is dropped."""
         if self._still_growing(obs):
             return self.own.absent(obs, Verdict(False, Status.LOST, _STILL_GROWING))
@@ -257,7 +267,7 @@ class TwoMaps:
         self.own, self._relation = new, Relation()
         if step.estimate.status is not Status.DEGRADED:
             new.life = replace(new.life, status=Status.RECOVERED)
-            again = replace(step.estimate, status=Status.RECOVERED, reason="new map: the object stayed lost in the old")
+            again = replace(step.estimate, status=Status.RECOVERED, reason=f"new map: {why}")
             step = replace(step, estimate=again)
         forgotten = NO_IDS if gone is None else gone.map.ids[gone.map.ids >= 0]
         return replace(step, requests=replace(step.requests, drop=forgotten))

@@ -904,6 +904,21 @@ def test_a_correction_mends_what_was_wrong():
         assert iou(method.masks["right"], masks["right"] & (frame.depth_m > 0)) > 0.85
 
 
+def test_a_correction_onto_another_thing_begins_a_new_map():
+    """What was followed was something else: nothing has to be lost first, and what came before stays in its own map."""
+    method, frames = Point2Pose(CAMERA, quick()), film()
+    method.add_object("left", clicks=clicks_on(frames[0][1]["right"]))
+    told = []
+    for k, (frame, masks) in enumerate(frames[:9]):
+        if k == 5:
+            method.correct("left", clicks=clicks_on(masks["left"]), negative=clicks_on(masks["right"]))
+        if k == 7:
+            method.correct("left", clicks=clicks_on(masks["left"]))  # of the same thing: nothing begins anew
+        told.append(method.step(frame)["left"])
+    assert [e.map_id for e in told] == [0] * 5 + [1] * 4 and all(e.inliers > 20 for e in told)
+    assert told[5].status is Status.RECOVERED and "by the correction" in told[5].reason
+
+
 def with_holes(frame: Frame, at: np.ndarray) -> Frame:
     """A frame without depth around pixels (N, 2)."""
     depth_m = frame.depth_m.copy()

@@ -19,7 +19,6 @@ from p2p_lib.segmenters.builtin.motion import Motions, parts_that_follow
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
     approximate_median,
-    components_touching,
     connected_components,
     dilated,
     plane_heights,
@@ -56,12 +55,14 @@ def by_geometry(
     plane: np.ndarray | None,
     config: SegmentationConfig,
     motions: Motions | None = None,
+    fringe: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence that an object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Returns the log-odds (h, w) and the
     component (h, w) bool that is connected with the seeds, empty unless it looks like one object. Parts beside it
-    that share its ``motions`` are added to it.
+    that share its ``motions`` are added to it. Where seeds are as dense as a mask, components with fewer of them a cell
+    than the share ``fringe`` of those of the one with most are touched by accident, and are not of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -81,7 +82,7 @@ def by_geometry(
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
     part = connected_components(free)
-    component = components_touching(part, seeds)
+    component = _components_held(part, seeds, fringe)
     if motions is not None:
         parts = parts_that_follow(patch, part, component, motions)
         component |= parts
@@ -92,6 +93,14 @@ def by_geometry(
         return log_odds, nothing  # it goes on beyond the patch: it is more than this object
     log_odds[component] += config.geometry_weight
     return log_odds, component
+
+
+def _components_held(part: np.ndarray, seeds: np.ndarray, fringe: float) -> np.ndarray:
+    """(h, w) bool: the components that hold seeds, but for those that no more than a ``fringe`` of them touches."""
+    size, held = np.bincount(part.ravel()), np.bincount(part[seeds], minlength=part.max() + 1)
+    held[0] = 0
+    density = held / np.maximum(size, 1)
+    return ((held > 0) & (density >= fringe * density[held.argmax()]))[part]
 
 
 def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: SegmentationConfig) -> np.ndarray:

@@ -18,6 +18,8 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 
 #: The flow is doubted if more of the mask jumped in depth, its area changed by more, or more of it lacks depth.
 _MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
+#: Flow moves the mask's outline a cell or two onto what lies beside: of that it covers less than this share.
+_FRINGE = 0.03
 #: Depth that returns after none of the object's was measured is its own within this distance of its last, m.
 _REAPPEARS_WITHIN_M = 0.1
 
@@ -81,7 +83,7 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
     plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
     T_cam_obj = hint.T_cam_obj if target.confident else None
     motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
-    log_odds, component = by_geometry(patch, core, plane, cfg, motions)
+    log_odds, component = by_geometry(patch, core, plane, cfg, motions, _FRINGE)
     stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
     # Parts that come into view are connected with those that were seen before.
