@@ -147,7 +147,7 @@ def test_a_component_that_few_seeds_touch_by_accident_is_not_taken_in():
     fringe = np.zeros(patch.shape, bool)
     fringe[rows[-1], columns[-1]] = True
     for seeds, is_it in ((plate | fringe, False), (plate | part, True)):
-        _, component = by_geometry(patch, seeds, None, CONFIG, fringe=0.03)
+        _, component = by_geometry(patch, seeds, None, CONFIG, fringe=0.1)
         assert component[plate].all() and component[part].all() == component[part].any() == is_it
     assert by_geometry(patch, plate | fringe, None, CONFIG)[1][part].all(), "clicks and points are never many"
 

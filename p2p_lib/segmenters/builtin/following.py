@@ -19,7 +19,7 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 #: The flow is doubted if more of the mask jumped in depth, its area changed by more, or more of it lacks depth.
 _MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
 #: Flow moves the mask's outline a cell or two onto what lies beside: of that it covers less than this share.
-_FRINGE = 0.03
+_FRINGE = 0.1
 #: Depth that returns after none of the object's was measured is its own within this distance of its last, m.
 _REAPPEARS_WITHIN_M = 0.1
 
