@@ -67,16 +67,17 @@ class NotebookResult:
 
 
 def list_notebooks(folder: Path | None = None, only: Sequence[str] = ()) -> list[Path]:
-    """The notebooks ``NN_*.ipynb`` of a folder in order; ``only`` picks by number (``"03"``) or by name."""
+    """The notebooks ``NN_*.ipynb`` of a folder in order; ``only`` picks by number (``"03"``, ``"3"``) or by name."""
     folder = folder or NOTEBOOKS
     found = sorted(folder.glob("[0-9][0-9]_*.ipynb"))
     if not found:
         raise MissingData(str(folder), "no notebooks NN_*.ipynb there", "Run from a clone of the repository.")
     picked = {}
     for wanted in map(str, only):
-        matches = [path for path in found if wanted.removesuffix(".ipynb") in (path.stem, path.stem[:2])]
+        matches = [path for path in found if wanted.removesuffix(".ipynb").zfill(2) in (path.stem, path.stem[:2])]
         if not matches:
-            raise BadInput("notebook", repr(wanted), "one of " + ", ".join(path.stem for path in found))
+            known = [path.stem for path in found]
+            raise BadInput("notebook", repr(wanted), "one of " + ", ".join(known), did_you_mean(wanted, known))
         picked.update(dict.fromkeys(matches))
     return sorted(picked) if only else found
 

@@ -263,7 +263,7 @@ class SelectionConfig(_Checked):
 class TsdfConfig(_Checked):
     """Of the reconstructed surface (section "3D Reconstruction")."""
 
-    voxel_m: float = _p(0.003, "A voxel has this edge.", "m", low=2e-4)
+    voxel_m: float = _p(0.003, "A voxel has this edge.", "m", low=2e-4, high=0.05)
     truncation_voxels: float = _p(5.0, "The truncation tau is so many voxels.", "voxels", "release", low=1)
     max_voxels: int = _p(8_000_000, "A volume has at most so many voxels; parts beyond are left out.", low=1000)
     carve: bool = _p(True, "Depth behind the object, outside the mask, carves free space.")
@@ -325,6 +325,19 @@ class Config:
     segmentation: SegmentationConfig = SegmentationConfig()
     oracle: OracleConfig = OracleConfig()
 
+    def __post_init__(self) -> None:
+        """A stage may be given as a table of some of its keys; what does not fit is refused."""
+        _of_preset(self.preset)
+        for key in _OF_ALL:
+            object.__setattr__(self, key, _value_of_all(key, getattr(self, key)))
+        for stage, kind in _STAGES.items():
+            given = getattr(self, stage)
+            if isinstance(given, Mapping):
+                table = {f"{stage}.{key}": value for key, value in given.items()}
+                object.__setattr__(self, stage, getattr(Config().with_values(table), stage))
+            elif not isinstance(given, kind):
+                raise BadInput(f"config {stage}", repr(given)[:60], f"a {kind.__name__}, or a table of its keys")
+
     def with_values(self, values: dict[str, Any], source: str = "") -> Config:
         """A copy with ``{"stage.key": value}`` replaced. Strings are read as TOML values.
 
@@ -332,16 +345,15 @@ class Config:
         value that does not fit. ``source`` says where the values came from, for the message.
         """
         changes: dict[str, Any] = {}
-        known: dict[str, Any] = {**_OF_ALL, **{f"{s}.{f.name}": f for s in _STAGES for f in fields(getattr(self, s))}}
         for key, value in values.items():
-            if key not in known:
-                raise _unknown(f"{source}: configuration key" if source else "configuration key", key, known)
+            if key not in _OF_ALL and key not in _FIELDS:
+                raise _unknown(f"{source}: configuration key" if source else "configuration key", key)
             if key in _OF_ALL:
                 changes[key] = _value_of_all(key, value)
             else:
                 stage, name = key.split(".")
                 part = changes.get(stage, getattr(self, stage))
-                changes[stage] = replace(part, **{name: _parse(value, type(known[key].default))})
+                changes[stage] = replace(part, **{name: _parse(value, type(_FIELDS[key].default))})
         return replace(self, **changes)
 
     def as_dict(self) -> dict[str, Any]:
@@ -380,11 +392,12 @@ def parameters(config: Config, only: str | None = None) -> list[dict[str, Any]]:
         if _PRESETS[config.preset].get(row["key"]) == row["value"]:
             row["source"] = "paper" if row["key"] in _TEXT else "release"
     if not rows:
-        raise BadInput(f"key of {stage}", repr(key), ", ".join(f.name for f in fields(getattr(config, stage))))
+        raise _unknown("configuration key", f"{stage}.{key}")
     return rows
 
 
-_STAGES = tuple(f.name for f in fields(Config) if dataclasses.is_dataclass(f.default))
+_STAGES = {f.name: type(f.default) for f in fields(Config) if dataclasses.is_dataclass(f.default)}
+_FIELDS = {f"{stage}.{f.name}": f for stage in _STAGES for f in fields(getattr(Config, stage))}
 
 #: What the paper's text says, or does without.
 _TEXT: dict[str, Any] = {
@@ -426,9 +439,14 @@ def preset(name: str = "default", seed: int = 0) -> Config:
     Traceback (most recent call last):
     p2p_lib.core.errors.BadInput: configuration key: got 'tsdf.voxel', expected ... Did you mean tsdf.voxel_m?
     """
+    return replace(Config().with_values(_of_preset(name) | {"seed": seed}), preset=name)
+
+
+def _of_preset(name: str) -> dict[str, Any]:
+    """Where this preset differs from the dataclasses' own values."""
     if not isinstance(name, str) or name not in _PRESETS:
         raise BadInput("preset", repr(name), f"one of {', '.join(_PRESETS)}", did_you_mean(str(name), _PRESETS))
-    return replace(Config().with_values(_PRESETS[name] | {"seed": seed}), preset=name)
+    return _PRESETS[name]
 
 
 def as_config(config: Config | str) -> Config:
@@ -468,14 +486,14 @@ def from_dict(table: Mapping[str, Any], source: str, base: Config | None = None)
     return base.with_values(values, source=source)
 
 
-def _unknown(what: str, key: str, known: Any) -> BadInput:
+def _unknown(what: str, key: str) -> BadInput:
     stage, _, name = str(key).partition(".")
     if name and stage in _STAGES:
         keys = [f.name for f in fields(getattr(Config, stage))]
         fix = did_you_mean(name, keys, f"{stage}.")
         return BadInput(what, repr(key), f"a key of [{stage}]: {', '.join(keys)}", fix)
     expected = f"stage.key, where stage is one of {', '.join(_STAGES)}"
-    return BadInput(what, repr(key), expected, did_you_mean(str(key), known))
+    return BadInput(what, repr(key), expected, did_you_mean(str(key), [*_OF_ALL, *_FIELDS]))
 
 
 #: Values of no stage: their type, how they are written, and what that means.

@@ -54,6 +54,12 @@ class MissingBackend(P2PError, ImportError):
         super().__init__(_sentence(f"{name}: {missing}", fix), name=name)
 
 
+def wrong_size(name: str, shape: tuple[int, ...], wanted: tuple[int, int], like: str, fix: str = "") -> BadInput:
+    """An image (H, W) of another size than that which ``like`` has: sizes are said width first, as those of files."""
+    got = "{1}x{0}".format(*shape) if len(shape) == 2 else f"shape {shape}"
+    return BadInput(name, got, f"{wanted[1]}x{wanted[0]} (width x height) as {like}", fix)
+
+
 def advised(error: P2PError, fix: str) -> P2PError:
     """The same error with more of what to do."""
     if isinstance(error, BadInput):
@@ -102,9 +108,10 @@ class Doubts:
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """``Did you mean NAME?``, of those that are known the nearest to a word; empty where none is near."""
-    near = get_close_matches(word, known, n=1)
-    return f"Did you mean {prefix}{near[0]}?" if near else ""
+    """``Did you mean NAME?``, of those known the nearest to a word, in capitals or not; empty where none is near."""
+    called = {name.lower(): name for name in known}
+    near = get_close_matches(word.lower(), called, n=1)
+    return f"Did you mean {prefix}{called[near[0]]}?" if near else ""
 
 
 def in_a_line(error: BaseException) -> str:

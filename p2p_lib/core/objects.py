@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_trouble
-from p2p_lib.core.errors import BadInput, doubt
+from p2p_lib.core.errors import BadInput, did_you_mean, doubt
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
@@ -110,6 +110,12 @@ class Objects(ABC, Generic[FollowedT]):
     def begin(self, name: str) -> None:
         """A new object, without anything known of it."""
 
+    def _check_known(self, what: str, name: str) -> None:
+        """Refuse a name that no object has, asked for by the call ``what``."""
+        if not isinstance(name, str) or name not in self.objects:
+            expected = "one of " + (", ".join(self.objects) or "no objects")
+            raise BadInput(what, repr(name)[:120], expected, did_you_mean(str(name), self.objects))
+
     def add_object(
         self,
         name: str,
@@ -148,8 +154,7 @@ class Objects(ABC, Generic[FollowedT]):
         box: ArrayLike | None = None,
     ) -> None:
         """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
-        if name not in self.objects:
-            raise BadInput("correct", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        self._check_known("correct", name)
         self.tell(_prompt(name, mask, clicks, negative, box))
 
     def tell(self, prompt: Prompt) -> None:
@@ -171,8 +176,7 @@ class Objects(ABC, Generic[FollowedT]):
 
         Under the same name another one may be added; its poses are in other maps (``map_id``).
         """
-        if name not in self.objects:
-            raise BadInput("remove_object", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+        self._check_known("remove_object", name)
         with self.alone():
             if len(ids := self.objects.pop(name).ids):
                 self.tracker.drop(ids)
@@ -192,8 +196,7 @@ class Objects(ABC, Generic[FollowedT]):
         and what is no time.
         """
         with self.alone():
-            if name not in self.objects:
-                raise BadInput("predict", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+            self._check_known("predict", name)
             return self._predictor.predict(name, time_s)
 
     def take_prompts(

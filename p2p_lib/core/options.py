@@ -31,7 +31,7 @@ def pairs(given: Iterable[str], option: str, form: str) -> dict[str, str]:
     """``["a=1", ...]``, as an option collects them, to ``{"a": "1", ...}``; ``form`` is how each is written."""
     found = {}
     for item in given:
-        name, equals, value = item.partition("=")
+        name, equals, value = (part.strip() for part in item.partition("="))
         if not (name and equals and value):
             raise BadInput(option, repr(item), form)
         found[name] = value
@@ -40,7 +40,7 @@ def pairs(given: Iterable[str], option: str, form: str) -> dict[str, str]:
 
 def names(given: str | None) -> tuple[str, ...] | None:
     """``"a,b"`` to ``("a", "b")``; None where nothing is named."""
-    return tuple(part for part in (given or "").split(",") if part) or None
+    return tuple(part.strip() for part in (given or "").split(",") if part.strip()) or None
 
 
 def _typed(help: str, *, flag: str = "", read: Callable[[Any], Any] | None = None, **how: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.errors import BadInput, doubt
+from p2p_lib.core.errors import BadInput, doubt, wrong_size
 from p2p_lib.core.files import file_name
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.types import Frame
@@ -48,8 +48,7 @@ class Prompt:
         if self.box_px is not None:
             object.__setattr__(self, "box_px", _box(f"box around {self.name!r}", self.box_px))
         if self.mask is not None:
-            mask = np.asarray(self.mask)
-            object.__setattr__(self, "mask", mask.copy() if mask.dtype == bool else mask > 0)
+            object.__setattr__(self, "mask", _mask(f"mask of {self.name!r}", self.mask))
         if not len(self.points_px) and not len(self.negative_px) and self.box_px is None and self.mask is None:
             raise BadInput(f"clicks on {self.name!r}", "none", "at least one [x, y] in pixels, a box or a mask")
         if self.mask is not None and (len(self.points_px) or len(self.negative_px) or self.box_px is not None):
@@ -68,13 +67,16 @@ class Prompt:
         return plain if self.mask is None else plain | {"mask_px": int(self.mask.sum())}
 
 
-def check_prompt(prompt: Prompt, camera: Camera) -> None:
-    """Refuse what does not lie in the image; :class:`BadInput` names the object, the frame's size and what to do."""
+def check_prompt(prompt: Prompt, camera: Camera, where: str = "") -> None:
+    """Refuse what does not lie in the image; :class:`BadInput` names the object, the frame's size and what to do.
+
+    where  says of which frame it is, if anybody knows: " in frame 3"
+    """
     name, size = prompt.name, f"{camera.width}x{camera.height}"
     for what, at in (("clicks on", prompt.points_px), ("negative clicks of", prompt.negative_px)):
         outside = ~camera.inside(at, -0.5)
         if outside.any():
-            raise BadInput(f"{what} {name!r} in frame {prompt.frame}", _pixel(at[outside][0]), f"pixels within {size}")
+            raise BadInput(f"{what} {name!r}{where}", _pixel(at[outside][0]), f"pixels within {size}")
     if prompt.box_px is not None:
         left, top, right, bottom = prompt.box_px
         if right < 0 or bottom < 0 or left > camera.width - 1 or top > camera.height - 1:
@@ -91,14 +93,13 @@ def check_prompt(prompt: Prompt, camera: Camera) -> None:
 def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
     """Refuse a mask of another size than the camera's images; none at all is fine."""
     if mask is not None and mask.shape != (camera.height, camera.width):
-        got = "x".join(map(str, mask.shape[::-1]))
-        raise BadInput(f"mask of {name!r}", got, f"{camera.width}x{camera.height} as the camera")
+        raise wrong_size(f"mask of {name!r}", mask.shape, (camera.height, camera.width), "the camera")
 
 
-def check_apart(others: Iterable[Prompt], prompt: Prompt) -> None:
-    """Refuse a click that is also one of another object's in the same frame, or on its mask."""
+def check_apart(others: Iterable[Prompt], prompt: Prompt, where: str = "") -> None:
+    """Refuse a click that is also one of another object's in the same frame, or on its mask; ``where`` as above."""
     for other in others:
-        check_not_on(prompt, other, prompt.frame)
+        check_not_on(prompt, other, where)
         if _meet(other.points_px, prompt.points_px):
             got = f"a click that is also one of {other.name!r}"
             raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel that belongs to one object only")
@@ -115,10 +116,10 @@ def check_depth(prompt: Prompt, frame: Frame) -> None:
         raise BadInput(f"box around {prompt.name!r}", got, "measured pixels near its centre", "Click on the object.")
 
 
-def check_not_on(prompt: Prompt, other: Prompt, frame_index: int) -> None:
-    """Refuse a click on what another object's mask in the same frame says is the other's."""
+def check_not_on(prompt: Prompt, other: Prompt, where: str = "") -> None:
+    """Refuse a click on what another object's mask in the same frame says is the other's; ``where`` as above."""
     if other.name != prompt.name and other.mask is not None and (on := in_mask(prompt.points_px, other.mask)).any():
-        got = f"{_pixel(prompt.points_px[on][0])} on the mask of {other.name!r} in frame {frame_index}"
+        got = f"{_pixel(prompt.points_px[on][0])} on the mask of {other.name!r}{where}"
         raise BadInput(f"clicks on {prompt.name!r}", got, "pixels of this object alone")
 
 
@@ -138,9 +139,10 @@ def given_masks(
         got = f"{type(frame).__name__} {getattr(frame, 'shape', '')}".strip()
         raise BadInput("frame", got, "Frame(index, time_s, rgb, depth_m)", "Colour needs its depth and its time.")
     if frame.shape != (camera.height, camera.width):
-        got = f"{frame.shape[1]}x{frame.shape[0]}"
-        raise BadInput(f"frame {frame.index}", got, f"{camera.width}x{camera.height} as the camera")
-    if unknown := sorted(set(masks) - set(objects)):
+        raise wrong_size(f"frame {frame.index}", frame.shape, (camera.height, camera.width), "the camera")
+    if not isinstance(masks, Mapping):
+        raise BadInput("masks", type(masks).__name__, "a dictionary: the name of each object, and its mask (H, W) bool")
+    if unknown := sorted(set(masks) - set(objects), key=str):
         known = ", ".join(objects) or "none yet"
         raise BadInput("masks", f"unknown object {unknown[0]!r}", f"objects added before: {known}")
     given = {name: Prompt(name, frame.index, mask=mask) for name, mask in masks.items() if mask is not None}
@@ -163,7 +165,7 @@ def _check_clicks(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> 
     """Refuse a prompt that depth or the masks given with its frame contradict."""
     check_depth(prompt, frame)
     for other in given.values():
-        check_not_on(prompt, other, frame.index)
+        check_not_on(prompt, other, f" in frame {frame.index}")
     if prompt.name in given and prompt.mask is None:
         fix = "Leave it out of the masks, or do not click on it."
         raise BadInput(f"mask of {prompt.name!r}", f"a mask and clicks in frame {frame.index}", "one of them", fix)
@@ -190,6 +192,15 @@ def _pixels(what: str, given: Any) -> np.ndarray:
     if at.size and (at.ndim != 2 or at.shape[1] != 2 or not np.isfinite(at).all()):
         raise BadInput(what, repr(given)[:60], "at least one [x, y] in pixels")
     return at.reshape(-1, 2)
+
+
+def _mask(what: str, given: Any) -> np.ndarray:
+    """A mask as bool, of any shape; a copy."""
+    try:
+        mask = np.asarray(given)
+        return mask.copy() if mask.dtype == bool else mask > 0
+    except (TypeError, ValueError):
+        raise BadInput(what, repr(given)[:60], "(H, W) bool: the object's pixels") from None
 
 
 def _box(what: str, given: Any) -> np.ndarray:

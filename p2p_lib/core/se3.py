@@ -146,7 +146,10 @@ def orthonormalised(T: np.ndarray) -> np.ndarray:
 
 def check(name: str, T: np.ndarray, tolerance: float = 1e-4) -> np.ndarray:
     """T as (4, 4) float64 if it is a rigid transformation, else :class:`BadInput` naming it."""
-    T = np.asarray(T, float)
+    try:
+        T = np.asarray(T, float)
+    except (TypeError, ValueError):
+        raise BadInput(name, repr(T)[:60], "a 4x4 transformation") from None
     if T.shape != (4, 4):
         raise BadInput(name, f"shape {T.shape}", "a 4x4 transformation")
     if not np.isfinite(T).all():

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, wrong_size
 
 #: What can be depth in any unit: so wide that ``p2p check`` still tells millimetres that were taken for metres.
 NEAREST_M, FARTHEST_M = 0.001, 1e4
@@ -59,9 +59,8 @@ class Frame:
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise BadInput(f"frame {self.index} colour", f"{rgb.shape} {rgb.dtype}", "(H, W, 3) uint8")
         if depth.shape != rgb.shape[:2]:
-            got = "x".join(map(str, depth.shape[::-1]))
-            want = f"{rgb.shape[1]}x{rgb.shape[0]} as the colour image"
-            raise BadInput(f"frame {self.index} depth", got, want, "Register the depth to the colour camera first.")
+            fix = "Register the depth to the colour camera first."
+            raise wrong_size(f"frame {self.index} depth", depth.shape, rgb.shape[:2], "the colour image", fix)
         if not np.issubdtype(depth.dtype, np.floating):
             raise BadInput(f"frame {self.index} depth", depth.dtype, "metres as floats", "Apply the depth scale first.")
         if not isinstance(self.time_s, Real) or not np.isfinite(self.time_s):

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, wrong_size
 from p2p_lib.core.files import LARGEST_IMAGE_PX, UNREADABLE, read_array, read_bytes, read_text, replacing
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -193,7 +193,7 @@ def read_raw_depth(path: Path) -> np.ndarray:
     else:
         raw = read_image(path, cv2.IMREAD_UNCHANGED, "a 16-bit depth image")
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
-        raise BadInput(str(path), f"{'x'.join(map(str, raw.shape))} {raw.dtype}", "one channel, uint16 or float32")
+        raise BadInput(str(path), f"{raw.shape} {raw.dtype}", "one channel, uint16 or float32")
     return raw
 
 
@@ -210,8 +210,7 @@ def check_size(
 ) -> None:
     """:class:`BadInput` naming the file where an image is not of the (height, width) that ``like`` has."""
     if image.shape[:2] != shape:
-        got, want = (f"{w}x{h}" for h, w in (image.shape[:2], shape))
-        raise BadInput(str(path), f"{got} pixels", f"{want} as {like}", fix)
+        raise wrong_size(str(path), image.shape[:2], shape, like, fix)
 
 
 def save_png(path: Path, image: np.ndarray) -> None:

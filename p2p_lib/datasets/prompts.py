@@ -128,8 +128,9 @@ def prompts_by_frame(
         if prompt.frame not in frames:
             fix = "Click in one of these, or take the run's first frame from there."
             raise BadInput(who, f"frame {prompt.frame}", f"a frame from {frames[0]} to {frames[-1]}", fix)
-        check_prompt(prompt, camera)
-        check_apart(found.setdefault(prompt.frame, ()), prompt)
+        where = f" in frame {prompt.frame}"
+        check_prompt(prompt, camera, where)
+        check_apart(found.setdefault(prompt.frame, ()), prompt, where)
         found[prompt.frame] += (prompt,)
         if not prompt.starts and prompt.name not in known:
             fix = "Click on it in that frame or before."

@@ -19,7 +19,7 @@ import numpy as np
 
 from p2p_lib.core import packages
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, in_a_line
+from p2p_lib.core.errors import BadInput, in_a_line, wrong_size
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.ros_messages import read_depth_m, read_rgb, seconds
 
@@ -81,9 +81,9 @@ class RosRecording:
                 lens, first_s = _Lens(self.name, self._info(), rgb.shape), time_s
                 self.camera = lens.camera
             if depth_m.shape != rgb.shape[:2]:
-                got, want = ("x".join(map(str, s[1::-1])) for s in (depth_m.shape, rgb.shape))
                 fix = "Record depth that is registered to colour (align_depth:=true), or name its topic: --depth."
-                raise BadInput(f"{self.name}: {self._topics['depth']}", got, f"{want} as colour", fix)
+                name = f"{self.name}: {self._topics['depth']}"
+                raise wrong_size(name, depth_m.shape, rgb.shape[:2], "colour", fix)
             yield Frame(index, time_s - first_s, *lens.straightened(rgb, depth_m))
             index += 1
         if lens is None:

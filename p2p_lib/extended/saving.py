@@ -94,8 +94,7 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
         Raises :class:`BadInput` where too little is known to find it again.
         """
         with self.alone():
-            if name not in self.objects:
-                raise BadInput("memory", repr(name), "one of " + (", ".join(self.objects) or "no objects"))
+            self._check_known("memory", name)
             return memory_in(self.objects[name], self.objects[name].known.map_id, **made_of)
 
 

@@ -113,7 +113,7 @@ class Point2Pose(Objects[FollowedT]):
         and ``self.tracks`` are the masks, given or segmented, and all objects' 2D tracks in it.
         """
         with self.alone(), self.stopwatch.frame(), uninterrupted():
-            tracked = self.front.track(self._inputs(frame, masks or {}))
+            tracked = self.front.track(self._inputs(frame, {} if masks is None else masks))
             self.frame = None if tracked is None else tracked.frame
             if tracked is None:
                 return {}

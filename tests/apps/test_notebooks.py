@@ -337,6 +337,7 @@ def test_a_kernel_that_dies_is_a_failure(tmp_path):
         ({"parameters": {"SEED": True}}, "00_a parameter SEED: got True, expected int like 0"),
         ({"parameters": {"NAME": 3}}, "00_a parameter NAME: got 3, expected str like 'a'"),
         ({"profile": "fast"}, "profile: got 'fast', expected one of quick, full"),
+        ({"parameters": {"sed": 1}, "only": ["0"]}, "00_a parameter: got sed, expected one of PROFILE, SEED"),
         ({"only": ["07"]}, "notebook: got '07', expected one of 00_a, 01_b"),
         ({"jobs": 0}, "jobs: got 0, expected at least 1"),
     ],

@@ -176,6 +176,19 @@ def test_unknown_presets_are_refused():
         preset("papr")
 
 
+def test_a_stage_may_be_a_table_of_its_keys_and_is_checked():
+    assert Config(tsdf={"carve": False}, seed="3") == Config().with_values({"tsdf.carve": False, "seed": 3})
+    for wrong, words in [
+        ({"tsdf": {"carv": 1}}, r"key: got 'tsdf.carv', .*Did you mean tsdf.carve\?"),
+        ({"tsdf": {"carve": 1}}, "config tsdf.carve: got 1 .*true or false"),
+        ({"tsdf": config.DepthConfig()}, "config tsdf: got DepthConfig.*, expected a TsdfConfig, or a table"),
+        ({"device": "tpu"}, "config device: got 'tpu'"),
+        ({"preset": "papr"}, r"preset: got 'papr', .*Did you mean paper\?"),
+    ]:
+        with pytest.raises(BadInput, match=words):
+            Config(**wrong)
+
+
 # --- bounds and types --------------------------------------------------------------------------
 
 
@@ -274,6 +287,7 @@ def test_every_value_survives_as_a_word(key, name):
         ("keypoint_map.maxpoints", "keypoint_map.max_points"),
         ("registration.inlier", "registration.inlier_m"),
         ("Seed", "seed"),
+        ("TSDF.CARVE", "tsdf.carve"),
     ],
 )
 def test_unknown_keys_name_the_nearest(key, near):
@@ -399,5 +413,5 @@ def test_a_key_given_for_a_stage_names_its_stage():
     with pytest.raises(BadInput, match=r"Did you mean method\?"):
         config.parameters(preset(), "mechanisms")
     assert [row["key"] for row in config.parameters(preset(), "method.mechanisms")] == ["method.mechanisms"]
-    with pytest.raises(BadInput, match=r"key of method: got 'mechanism', expected .*mechanisms"):
+    with pytest.raises(BadInput, match=r"key: got 'method.mechanism', .*Did you mean method.mechanisms\?"):
         config.parameters(preset(), "method.mechanism")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.depth import check_metres
-from p2p_lib.core.errors import BadInput, Doubt, Doubts, MissingBackend, MissingData, P2PError
+from p2p_lib.core.errors import BadInput, Doubt, Doubts, MissingBackend, MissingData, P2PError, did_you_mean
 from p2p_lib.core.types import Frame
 
 EVERY = [
@@ -64,6 +64,11 @@ def test_errors_cross_process_borders(error):
     """A worker process hands its error to the parent as a pickle."""
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is type(error) and str(again) == str(error)
+
+
+@pytest.mark.parametrize(("word", "meant"), [("sed", "SEED"), ("Seeed", "SEED"), ("Bxo", "box"), ("zzz", None)])
+def test_what_is_meant_is_found_in_capitals_and_without(word, meant):
+    assert did_you_mean(word, ["SEED", "box"], "of.") == (f"Did you mean of.{meant}?" if meant else "")
 
 
 def test_doubts_that_differ_in_numbers_are_one_but_not_those_of_other_names():

@@ -8,7 +8,7 @@ import pytest
 
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.options import RunOptions, add_options, differing
+from p2p_lib.core.options import RunOptions, add_options, differing, names, pairs
 
 #: What is typed for each field, and what the field is then.
 TYPED = {
@@ -80,6 +80,11 @@ def test_a_command_takes_some_of_them():
 def test_what_is_no_pair_is_refused(words):
     with pytest.raises(BadInput, match=rf"{words[0]}: got '{words[1]}'"):
         parsed(*words)
+
+
+def test_spaces_around_what_is_typed_are_not_meant():
+    assert pairs(["tsdf.voxel_m = 0.01", " a=b c "], "--set", "") == {"tsdf.voxel_m": "0.01", "a": "b c"}
+    assert names("mug, tin can ,") == ("mug", "tin can")
 
 
 def test_later_wins_over_earlier_in_the_configuration(tmp_path):

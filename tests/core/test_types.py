@@ -47,8 +47,8 @@ def test_readings_that_are_none_become_zero(reading, dtype):
         (RGB[..., 0], DEPTH, 0.0, r"frame 7 colour: got \(4, 6\) uint8, expected \(H, W, 3\) uint8"),
         (RGB.astype(float), DEPTH, 0.0, r"frame 7 colour: got \(4, 6, 3\) float64"),
         (np.zeros((4, 6, 4), np.uint8), DEPTH, 0.0, r"frame 7 colour: got \(4, 6, 4\)"),
-        (RGB, DEPTH[:3], 0.0, "frame 7 depth: got 6x3, expected 6x4 as the colour image. Register"),
-        (RGB, DEPTH[..., None], 0.0, "frame 7 depth: got 1x6x4, expected 6x4"),
+        (RGB, DEPTH[:3], 0.0, r"frame 7 depth: got 6x3, expected 6x4 \(width x height\) as the colour image. Register"),
+        (RGB, DEPTH[..., None], 0.0, r"frame 7 depth: got shape \(4, 6, 1\), expected 6x4"),
         (RGB, np.full((4, 6), 500, np.uint16), 0.0, "frame 7 depth: got uint16, expected metres as floats"),
         (RGB, DEPTH, np.nan, "frame 7 time_s: got nan"),
         (RGB, DEPTH, np.inf, "frame 7 time_s: got inf"),
@@ -59,6 +59,12 @@ def test_readings_that_are_none_become_zero(reading, dtype):
 def test_frame_refuses(rgb, depth, time_s, words):
     with pytest.raises(BadInput, match=words):
         Frame(7, time_s, rgb, depth)
+
+
+@pytest.mark.parametrize("T_world_cam", ["x", {}, [[1, 2], [3]], [["x"] * 4] * 4, 3])
+def test_a_camera_pose_that_is_no_matrix_is_refused(T_world_cam):
+    with pytest.raises(BadInput, match=r"frame 7 T_world_cam: got .*, expected a 4x4 transformation"):
+        Frame(7, 0.0, RGB, DEPTH, T_world_cam)
 
 
 @pytest.mark.parametrize("index", [None, "a", 1.5, 2.0, -1, True, np.float64(3)])

@@ -69,22 +69,22 @@ FAULTS = {
     "colour of another size": (
         "rgb/0002.png",
         np.zeros((H, W + 2, 3), np.uint8),
-        r"rgb/0002\.png: got 42x30 pixels, expected 40x30 as the first image",
+        r"rgb/0002\.png: got 42x30, expected 40x30 \(width x height\) as the first image",
     ),
     "depth of another size": (
         "depth/0001.png",
         np.zeros((H // 2, W // 2), np.uint16),
-        r"depth/0001\.png: got 20x15 pixels, expected 40x30 as the colour image\. Register",
+        r"depth/0001\.png: got 20x15, expected 40x30 \(width x height\) as the colour image\. Register",
     ),
     "depth of eight bits": (
         "depth/0001.png",
         np.zeros((H, W), np.uint8),
-        r"depth/0001\.png: got 30x40 uint8, expected one channel, uint16",
+        r"depth/0001\.png: got \(30, 40\) uint8, expected one channel, uint16",
     ),
     "depth in colour": (
         "depth/0001.png",
         np.zeros((H, W, 3), np.uint16),
-        r"depth/0001\.png: got 30x40x3 uint16, expected one channel",
+        r"depth/0001\.png: got \(30, 40, 3\) uint16, expected one channel",
     ),
     "no depth folder": ("depth", None, "depth: no such folder, expected depth images"),
     "no camera": ("cam_K.txt", None, rf"cam_K\.txt: no such file, {MATRIX}"),
@@ -128,7 +128,7 @@ FAULTS = {
     "mask of another size": (
         "masks/can/0001.png",
         np.zeros((8, 9), np.uint8),
-        r"masks/can/0001\.png: got 9x8 pixels, expected 40x30",
+        r"masks/can/0001\.png: got 9x8, expected 40x30",
     ),
     "labels too short": (LABELS, np.ones(N - 1, bool), rf"{LABELS}: got shape \(2,\) bool, expected 3 labels"),
     "labels pickled": (LABELS, np.array([{}] * N), f"{LABELS}: got an unreadable array"),

@@ -677,14 +677,16 @@ def test_refusals_name_what_came_and_what_is_known():
     method.add_object("left")
     with pytest.raises(BadInput, match="masks: got unknown object 'right', expected objects added before: left"):
         method.step(frame, masks)
-    with pytest.raises(BadInput, match=r"mask of 'left': got 300x400, expected 400x300 as the camera"):
+    with pytest.raises(
+        BadInput, match=r"mask of 'left': got 300x400, expected 400x300 \(width x height\) as the camera"
+    ):
         method.step(frame, {"left": masks["left"].T})
-    with pytest.raises(BadInput, match=r"mask of 'left': got 3x400x300, expected 400x300"):
+    with pytest.raises(BadInput, match=r"mask of 'left': got shape \(300, 400, 3\), expected 400x300"):
         method.step(frame, {"left": np.zeros((300, 400, 3), bool)})
     with pytest.raises(BadInput, match=r"mask of 'right': got 10x10, expected 400x300"):
         method.add_object("right", mask=np.ones((10, 10), bool))
     small = Frame(3, 0.0, frame.rgb[:200, :300], frame.depth_m[:200, :300])
-    with pytest.raises(BadInput, match="frame 3: got 300x200, expected 400x300 as the camera"):
+    with pytest.raises(BadInput, match=r"frame 3: got 300x200, expected 400x300 \(width x height\) as the camera"):
         method.step(small, {})
     with pytest.raises(
         BadInput, match=r"frame: got ndarray \(300, 400, 3\), expected Frame\(index, time_s, rgb, depth_m\)"
@@ -694,6 +696,16 @@ def test_refusals_name_what_came_and_what_is_known():
         method.add_object("left")
     with pytest.raises(BadInput, match="remove_object: got 'cup', expected one of left"):
         method.remove_object("cup")
+    with pytest.raises(BadInput, match=r"correct: got \['left'\], expected one of left. Did you mean left\?"):
+        method.correct(["left"], clicks=[[5, 5]])
+    with pytest.raises(BadInput, match=r"clicks on 'left': got \(999, 5\), expected pixels within 400x300$"):
+        method.correct("left", clicks=[[999, 5]])  # of which frame is not known yet
+    for wrong in ([masks["left"]], masks["left"], "left", 3, []):
+        with pytest.raises(BadInput, match=rf"masks: got {type(wrong).__name__}, expected a dictionary"):
+            method.step(frame, wrong)
+    for wrong in ("x", {}, [[1], [1, 2]], np.full((300, 400), "x")):
+        with pytest.raises(BadInput, match=r"mask of 'left': got .*, expected \(H, W\) bool"):
+            method.correct("left", mask=wrong)
     assert list(method.objects) == ["left"]
 
 
@@ -853,7 +865,7 @@ def test_a_click_on_anothers_mask_is_refused():
     method, (frame, masks) = Point2Pose(CAMERA, quick()), film()[0]
     on_left = clicks_on(masks["left"])
     method.add_object("left", mask=masks["left"])
-    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left' in frame 0"):
+    with pytest.raises(BadInput, match=r"clicks on 'right': got \(\d+, \d+\) on the mask of 'left'"):
         method.add_object("right", clicks=on_left)
     assert list(method.objects) == ["left"]
     method.remove_object("left")
