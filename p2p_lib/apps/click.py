@@ -32,7 +32,7 @@ from p2p_lib.core.files import parse_json
 from p2p_lib.core.prompts import Prompt, check_depth
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.mask_log import load_masks, mask_length_m
-from p2p_lib.datasets.prompts import load_prompts, parse_prompts, prompts_by_frame, run_lengths, save_prompts
+from p2p_lib.datasets.prompts import as_entry, load_prompts, parse_prompts, prompts_by_frame, run_lengths, save_prompts
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.suspicions import doubt_growth
@@ -98,7 +98,7 @@ class Clicker(AbstractContextManager):
             "names": list(self.run.objects if self.run else self.sequence.objects),
             "run": self.run is not None,
             "colours": OBJECTS,
-            "objects": [_plain(prompt) for prompt in self.prompts],
+            "objects": [as_entry(prompt) for prompt in self.prompts],
         }
 
     def _image_png(self, i: int) -> bytes:
@@ -168,16 +168,9 @@ class Clicker(AbstractContextManager):
         return ""
 
 
-def _plain(prompt: Prompt) -> dict[str, Any]:
-    """As the page takes it: with the mask itself."""
-    plain = prompt.as_dict()
-    plain.pop("mask_px", None)
-    return plain if prompt.mask is None else plain | {"mask": run_lengths(prompt.mask)}
-
-
 def first_change(before: Iterable[Prompt], after: Iterable[Prompt]) -> int | None:
     """The first frame of which other things are said; None where nothing has changed."""
-    one, other = ({(prompt.frame, json.dumps(_plain(prompt))) for prompt in prompts} for prompts in (before, after))
+    one, other = ({(prompt.frame, json.dumps(as_entry(prompt))) for prompt in prompts} for prompts in (before, after))
     return min((frame for frame, _ in one ^ other), default=None)
 
 

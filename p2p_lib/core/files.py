@@ -105,9 +105,8 @@ def read_array(path: Path, expected: str) -> np.ndarray:
         raise BadInput(str(path), f"an unreadable array ({error})", expected) from None
 
 
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
+def load_arrays(path: Path, expected: str = "arrays as p2p run wrote them") -> dict[str, np.ndarray]:
     """The arrays of an ``.npz`` file by name, none where there is no file; :class:`BadInput` where it is damaged."""
-    expected = "arrays as p2p run wrote them"
     if not path.exists():
         return {}
     if not path.is_file():

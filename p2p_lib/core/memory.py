@@ -226,7 +226,7 @@ def read_memories(path: str | Path, kind: str, expected: str) -> tuple[dict[str,
     path = Path(path)
     if not path.exists():
         raise MissingData(str(path), f"no such file, expected {expected}")
-    arrays = load_arrays(path)
+    arrays = load_arrays(path, expected)
     head = arrays.pop("about", np.zeros(0, np.uint8))
     head = parse_json(head.tobytes(), str(path), expected) if head.dtype == np.uint8 and head.size else {}
     if not isinstance(head, dict) or head.get("kind") != kind:

@@ -99,6 +99,13 @@ def run_lengths(mask: np.ndarray) -> dict[str, list[int]]:
     return {"size": list(mask.shape), "counts": np.diff([0, *changes, flat.size]).tolist()}
 
 
+def as_entry(prompt: Prompt) -> dict[str, Any]:
+    """As :func:`parse_prompts` reads it without a folder: with the mask itself, as run lengths."""
+    plain = prompt.as_dict()
+    plain.pop("mask_px", None)
+    return plain if prompt.mask is None else plain | {"mask": run_lengths(prompt.mask)}
+
+
 def _of_runs(what: str, given: Any) -> np.ndarray:
     """The mask of run lengths."""
     try:

@@ -22,7 +22,7 @@ from p2p_lib.method import pipeline
 from p2p_lib.method.object_tracker import ObjectTracker
 
 #: A file of :meth:`Savable.save`: its kind, and what that is to people.
-_SAVED, _SAVED_BY = "p2p tracker", "a tracker as Point2Pose.save writes it"
+_SAVED, _SAVED_BY = "p2p tracker", "a tracker as tracker.save(path) writes it"
 #: What a tracker is given by name, or as an instance.
 _PARTS = ("tracker", "detector", "segmenter")
 #: What a memory says of the run that it was learnt in: nothing of where its files are.
@@ -40,12 +40,16 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
     def save(self, path: str | Path) -> None:
         """Keep what is known of all objects, as plain data, for :meth:`load`; before :meth:`close`.
 
+        Of objects that have not started yet, what is to start them in the next frame: their clicks, box or mask.
+
         Tracker, detector and segmenter are kept by the names that were asked for, ``package.module:Class`` among them.
         One that was given as an instance is no plain data: :meth:`load` asks for it.
 
         :class:`BadInput` for an object of which too little is known to find it again, and with preset ``paper``, whose
         objects begin with no memory.
         """
+        from p2p_lib.datasets.prompts import as_entry  # here, since what tracks reads no datasets
+
         with self.alone():
             if paper := [name for name, obj in self.objects.items() if not isinstance(obj, TwoMaps)]:
                 got = f"{paper[0]!r} with mechanisms none"
@@ -55,8 +59,9 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
             frozen = {name: isinstance(obj, Remembered) and obj.frozen for name, obj in self.objects.items()}
             given = dict(zip(_PARTS, self._made_of[2:], strict=True))
             parts = {kind: part if isinstance(part, str) else [type(part).__name__] for kind, part in given.items()}
-            about = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen, **parts}
-            save_memories(path, learnt, _SAVED, about)
+            about: dict[str, Any] = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen}
+            waiting = [as_entry(prompt) for name, prompt in self._prompts.items() if name not in learnt]
+            save_memories(path, learnt, _SAVED, about | {"prompts": waiting, **parts})
 
     @classmethod
     def load(cls, path: str | Path, camera: Camera | None = None, **parts: Any) -> Self:
@@ -67,6 +72,8 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
 
         Raises as :func:`p2p_lib.core.memory.load_memory`, and :class:`BadInput` where a part is needed.
         """
+        from p2p_lib.datasets.prompts import parse_prompts
+
         about, learnt = read_memories(path, _SAVED, _SAVED_BY)
         try:
             saved = {kind: about[kind] for kind in _PARTS}
@@ -83,6 +90,8 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
         loaded: Any = cls(camera, config, **(saved | parts))
         for name, is_frozen in frozen.items():
             loaded.add_object(name, memory=learnt.get(name), frozen=is_frozen)
+        for prompt in parse_prompts({"objects": waiting}) if (waiting := about.get("prompts")) else ():
+            loaded.tell(prompt)
         return loaded
 
     def memory(self, name: str, **made_of: Any) -> ObjectMemory:

@@ -78,6 +78,32 @@ def test_a_part_that_was_an_instance_is_asked_for(saved, tmp_path):
         assert loaded.tracker.name == "lk", "in place of the saved one"
 
 
+def test_what_is_to_start_an_object_is_kept(tmp_path):
+    """A tracker that is saved before its first frame; a correction of a mask is of no use another day."""
+    mask = np.zeros((240, 320), bool)
+    mask[40:90, 50:120] = True
+    with Point2Pose(CAMERA) as method:
+        method.add_object("cup", clicks=[[100, 90], [110, 95]], negative=[[20, 20]])
+        method.add_object("can", box=[200, 50, 260, 120])
+        method.add_object("tin", mask=mask)
+        method.add_object("later")
+        method.add_object("ball", memory=made_memory())
+        method.correct("ball", clicks=[[300, 200]])
+        method.save(tmp_path / "tracker.npz")
+    with Point2Pose.load(tmp_path / "tracker.npz") as loaded:
+        kept = loaded._prompts
+        assert [*loaded.objects] == ["cup", "can", "tin", "later", "ball"] and {*kept} == {"cup", "can", "tin"}
+        assert kept["cup"].points_px.tolist() == [[100, 90], [110, 95]]
+        assert kept["cup"].negative_px.tolist() == [[20, 20]] and kept["can"].box_px.tolist() == [200, 50, 260, 120]
+        np.testing.assert_array_equal(kept["tin"].mask, mask)
+
+
+def test_what_is_no_tracker_is_refused_as_such(tmp_path):
+    (tmp_path / "junk.npz").write_text("junk")
+    with pytest.raises(BadInput, match=r"junk\.npz: got .*, expected a tracker as tracker\.save\(path\) writes it"):
+        Point2Pose.load(tmp_path / "junk.npz")
+
+
 def test_the_paper_has_nothing_to_be_saved(tmp_path):
     method = Point2Pose(CAMERA, preset("paper"))
     method.save(tmp_path / "empty.npz")
