@@ -6,7 +6,7 @@ Scores a 2D tracker by itself and any method's poses as well, and writes a run i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,10 @@ from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_t
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
-from p2p_lib.datasets.depth_units import beyond, distance_m
+from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
+from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
@@ -271,17 +272,22 @@ def _doubt_depth(job: _Job) -> None:
         doubt("depth", *found.doubt)
 
 
-def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> set[str]:
-    """Warn of objects that are where depth does not count; those whose mask and its depth tell, in range or not.
+def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None], known_m: Container[str]) -> set[str]:
+    """Warn of objects that are where depth does not count, and of those of odd sizes, unless they are known.
 
+    Returns those whose mask and its depth tell, in range or not.
     A run goes on without a pose then, as where a unit is another, and would say so at its end only.
     """
     limits, least_px = job.config.depth, job.config.lifecycle.min_mask_px
     large = {name: mask for name, mask in masks.items() if mask is not None and np.count_nonzero(mask) >= least_px}
     away_m = {name: m for name, mask in large.items() if np.isfinite(m := distance_m(frame, mask))}
     out_m = {name: m for name, m in away_m.items() if in_range(frame.depth_m[large[name]], limits).mean() < _HARDLY}
-    if out_m and (wrong := beyond(out_m, limits, getattr(job.sequence, "depth_scale", 1.0))):
+    scale = getattr(job.sequence, "depth_scale", 1.0)
+    if out_m and (wrong := beyond(out_m, limits, scale)):
         doubt(f"depth of {next(iter(out_m))!r} in frame {frame.index}", *wrong)
+    for name in (name for name in away_m if name not in out_m and name not in known_m):
+        if wrong := odd_size(mask_length_m(frame, large[name], job.sequence.camera), away_m[name], scale):
+            doubt(f"size of {name!r} in frame {frame.index}", *wrong)
     return set(away_m)
 
 
@@ -373,7 +379,8 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
                     if drawn and progress:
                         bar.clear()
                         say(f"{what} masks of {', '.join(drawn)} in frame {frame.index}: {keeper.first_masks.path}")
-                unseen -= _doubt_range(job, frame, {n: mask for n, mask in method.masks.items() if n in unseen})
+                masks = {name: mask for name, mask in method.masks.items() if name in unseen}
+                unseen -= _doubt_range(job, frame, masks, keeper.sizes_m)
                 now = ", ".join(f"{name} {estimate.status}" for name, estimate in estimates.items())
                 bar.set_postfix_str(now, refresh=False)
                 bar.update()

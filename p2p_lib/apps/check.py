@@ -27,7 +27,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, evenly
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
-from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units
+from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size
 from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
@@ -137,6 +137,8 @@ def check_folder(
             continue
         if name in sizes_m:
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
+        elif wrong_size := odd_size(mask_length_m(frame, mask, sequence.camera), distance_m(frame, mask), scale):
+            findings.append(Finding(f"{name}: size", Level.LOOK, *wrong_size))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))
         warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]

@@ -21,6 +21,8 @@ UNITS_M = {
 }
 #: Where things stand that are tracked, m.
 _STANDS_M = (0.15, 5.0)
+#: How long they are, m: a spatula and a keyboard have 0.4, what of a tin looks out behind another one 0.035.
+_LONG_M = (0.02, 0.8)
 #: Fraction of a mask that should have a depth.
 MEASURED_SHARE = 0.5
 
@@ -54,6 +56,22 @@ def beyond(away_m: Mapping[str, float], limits: DepthConfig, scale: float) -> tu
     text = f"{first_m:.2f} m away"
     text += f" ({', '.join(f'{name} {other_m:.2f} m' for name, other_m in others)})" if others else ""
     text += f", but {limits.min_m:g} to {limits.max_m:g} m count"
-    guess = f". {units}" if (units := likely_units(first_m, scale)) else ""
     wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
-    return text, f"If it was, --set depth.{wider}; if it was not, the depth scale is wrong (--depth-scale){guess}."
+    return text, f"If it was, --set depth.{wider}; if it was not, {_wrong_scale(first_m, scale)}"
+
+
+def odd_size(length_m: float, away_m: float, scale: float) -> tuple[str, str] | None:
+    """What to say of an object so long, or so short, as nothing is that is tracked, and what to do; NaN: not measured.
+
+    length_m  of what its mask holds, at the distance away_m
+    """
+    if not (length_m < _LONG_M[0] or length_m > _LONG_M[1]):
+        return None
+    fix = f"If it is not, its mask is of something else, or {_wrong_scale(away_m, scale)}"
+    return f"{100 * length_m:.2g} cm long, {away_m:.2f} m away", fix
+
+
+def _wrong_scale(away_m: float, scale: float) -> str:
+    """That depth may have another unit, and which would put what is so far away where things stand."""
+    guess = f". {units}" if (units := likely_units(away_m, scale)) else ""
+    return f"the depth scale is wrong (--depth-scale){guess}."

@@ -395,6 +395,21 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     assert frame.index == 0
 
 
+@pytest.mark.parametrize("times", [0.1, 6.0])
+def test_a_wrong_unit_shows_in_an_objects_size_where_its_distance_may_be(good, times, tmp_path, recwarn):
+    scaled = replace(open_sequence(good), depth_scale=0.001 * times)
+    wide = {"config": preset().with_values({"depth.min_m": 0.01, "depth.max_m": 10.0})}
+    finding = found(scaled, "box: size", **wide)
+    assert finding.level is Level.LOOK and re.fullmatch(r"[\d.]+ cm long, [\d.]+ m away", finding.text)
+    assert "--depth-scale). A unit of" in finding.fix
+    assert "box: size" not in [f.name for f in check_folder(good, **wide)]
+    for sizes, doubted in (({}, True), ({"box": 60}, False)):
+        settings = {"depth.min_m": 0.01, "depth.max_m": 10.0}
+        run(scaled, tmp_path / f"{doubted}", objects=["box"], stop=1, settings=settings, sizes=sizes, progress=False)
+        assert any("size of 'box' in frame 0" in str(doubt.message) for doubt in recwarn) == doubted
+        recwarn.clear()
+
+
 def test_depth_that_was_cut_off_must_be_exported_again(good, tmp_path):
     (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 1000)))
     assert wrong.name == "depth" and "cut off at 65.5 m" in wrong.text and "Export the depth again" in wrong.fix
