@@ -341,3 +341,15 @@ def test_nothing_found_is_said():
     speck[108:111, 173:176] = frame.depth_m[108:111, 173:176]
     with pytest.warns(Doubt, match="clicks on 'right' in frame 0: no object was found there"):
         segmenter().segment(Frame(0, 0.0, frame.rgb, speck), [Prompt("right", points_px=[[174, 109]])])
+
+
+@pytest.mark.parametrize("say", [{"points_px": [[280, 200]]}, {"box_px": (278, 198, 283, 203)}])
+def test_what_selects_nothing_leaves_an_object_its_mask(say):
+    """A correction on a speck of depth where nothing else has any; the object goes on as it was."""
+    follow, frame = segmenter(), picture(1)
+    speck = np.where(rectangle(230, 150, 320, 240), 0, frame.depth_m)
+    speck[199:202, 279:282] = frame.depth_m[199:202, 279:282]
+    follow.segment(picture(0), [Prompt("left", mask=LEFT)])
+    with pytest.warns(Doubt, match=r"'left' in frame 1: no object was found there\. It keeps the mask that it had\."):
+        kept = follow.segment(Frame(1, 1 / 30, frame.rgb, speck), [Prompt("left", 1, **say)]) == 1
+    assert iou(kept, LEFT) > 0.9 and iou(follow.segment(picture(2)) == 1, LEFT) > 0.9

@@ -26,7 +26,7 @@ from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
-from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
+from p2p_lib.segmenters.builtin.start_doubts import doubt_nothing, doubt_prompt
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
 
@@ -140,8 +140,7 @@ class BuiltinSegmenter:
         """Locate one object outside what is ``taken`` (H, W) bool; the updated target and its probability map."""
         target = self._targets.get(name, Target()).with_learnt(view.previous, view.focal_px, view.config)
         if cutter is not None:
-            claim = self._segment_prompt(view, cutter, target, hints, taken, due)
-            return Target(), claim  # its colours and its size are learnt anew
+            return self._segment_prompt(view, cutter, target, hints, taken, due)
         return self._follow(view, name, target, hints, taken, due)
 
     def _follow(
@@ -162,16 +161,25 @@ class BuiltinSegmenter:
 
     def _segment_prompt(
         self, view: View, cutter: Cutter, target: Target, hints: Mapping[str, Hint], taken: np.ndarray, due: bool
-    ) -> Claim:
-        """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask."""
-        was, name, seen = np.zeros(view.frame.shape, bool), cutter.prompt.name, target.seen
-        if cutter.prompt.box_px is None and seen is not None and view.previous is view.frame:
-            was[seen.box.slices] = seen.mask  # the same image once more: that mask is meant
-        elif cutter.prompt.box_px is None:
-            _mark(was, self._follow(view, name, target, hints, taken, due)[1])
-        if was.any():
-            return cutter.correct(was)
-        return cutter.start() if cutter.prompt.starts else None
+    ) -> tuple[Target, Claim]:
+        """Segment from a prompt; clicks on an object that has a mask in this frame correct that mask.
+
+        What selects nothing leaves an object the mask that it has.
+        """
+        had: tuple[Target, Claim]
+        if (seen := target.seen) is not None and view.previous is view.frame:
+            had = target, (seen.box, seen.mask.astype(np.float32))  # the same image once more: that mask is meant
+        else:
+            had = self._follow(view, cutter.prompt.name, target, hints, taken, due)
+        was = np.zeros(view.frame.shape, bool)
+        _mark(was, had[1])
+        if not cutter.prompt.starts:
+            return Target(), cutter.correct(was) if was.any() else None
+        box, x = cutter.correct(was) if was.any() and cutter.prompt.box_px is None else cutter.start()
+        if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
+            doubt_nothing(cutter, "It keeps the mask that it had.")
+            return had
+        return Target(), (box, x)  # its colours and its size are learnt anew
 
     def _cut_out(
         self,

@@ -32,13 +32,11 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
     others  the other objects' masks (H, W) bool in this frame
     starts  whether it started the object: what was right before its correction is known to the user
     """
-    frame, name = cutter.frame, cutter.prompt.name
-    who = f"{'clicks on' if len(cutter.prompt.points_px) else 'box around'} {name!r} in frame {frame.index}"
     if not mask.any():
-        fix = "Click near its centre and on parts of other colours, or draw a box."
-        return doubt(who, "no object was found there", fix)
+        return doubt_nothing(cutter)
     if not starts:
         return None
+    frame, who = cutter.frame, _who(cutter)
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
@@ -59,6 +57,17 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
         got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
         doubt(who, got, f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it.")
     return None
+
+
+def doubt_nothing(cutter: Cutter, instead: str = "") -> None:
+    """Warn that a prompt has selected nothing; ``instead`` says what its object has for a mask."""
+    fix = "Click near its centre and on parts of other colours, or draw a box."
+    doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip())
+
+
+def _who(cutter: Cutter) -> str:
+    what = "clicks on" if len(cutter.prompt.points_px) else "box around"
+    return f"{what} {cutter.prompt.name!r} in frame {cutter.frame.index}"
 
 
 def _flat(patch: Patch, inside: np.ndarray) -> bool:
