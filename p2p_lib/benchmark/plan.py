@@ -24,6 +24,9 @@ PROFILES = ("quick", "full")
 #: Where the plans of this package lie, and the prompts of sequences that methods from clicks start from.
 PLANS, PROMPTS = Path(__file__).parent / "plans", Path(__file__).parent / "prompts"
 
+#: Preset, tracker and masks of the paper.
+_PAPERS = ("paper", "tapir", "sam2_video")
+
 Text = Annotated[str, Field(min_length=1)]
 Count = Annotated[int, Field(ge=0)]
 
@@ -31,7 +34,8 @@ Count = Annotated[int, Field(ge=0)]
 class Method(Strict):
     """One way to run: a row or column of the table.
 
-    paper     the method of the paper's table that it stands beside ("Ours", "No SDF refinement"), "" for none
+    paper     the method of the paper's table that it is ("Ours", "No SDF refinement"): its figures stand beside it. ""
+              for all others: no stand-in has them
     against   the method that it is compared with, run by run (a plan of kind ``pairs``)
     gpu       whether it is left out where there is no GPU: its networks take seconds a frame without one
     masks     as of ``p2p run``; clicks are those kept for the sequence (:func:`prompts_file`), or drawn where there are
@@ -57,6 +61,12 @@ class Method(Strict):
     count: Count = 0
     only: list[Text] = []
     but: list[Text] = []
+
+    @model_validator(mode="after")
+    def _is_the_papers(self) -> Method:
+        if self.paper and (self.preset, self.tracker, self.masks) != _PAPERS:
+            raise ValueError(f"paper = {self.paper!r}: only with preset, tracker and masks {', '.join(_PAPERS)}")
+        return self
 
     def runs_on(self, sequence: str) -> bool:
         """Whether it runs on the sequence of this name."""

@@ -77,7 +77,8 @@ def by_grid(numbers: Numbers) -> Table:
     how += "which every method ran"
     over = f"mean over seeds {', '.join(map(str, numbers.seeds))}" if len(numbers.seeds) > 1 else "one seed"
     notes = [how, f"{numbers.HOW.capitalize()}; {numbers.scored()}; {over}", *numbers.about()]
-    return Table(numbers.plan.title, ["Sequence", *trackers], lines, groups, rules=rules, notes=notes)
+    heads = ["Sequence", *(tracker or "built-in" for tracker in trackers)]
+    return Table(numbers.plan.title, heads, lines, groups, rules=rules, notes=notes)
 
 
 def _three(values: np.ndarray) -> Cell:
@@ -107,9 +108,9 @@ def by_pair(numbers: Numbers) -> Table:
         cells += [_interval([w[1] for at, w in worth.items() if at[0] == scene], numbers.judges) for scene in scenes]
         name = method.name.removeprefix(method.against).lstrip(", ")
         lines.append([Cell(""), Cell(name), Cell(str(len(worth))), *cells])
-    heads = ["2D tracker", "component", "runs", *AREA_HEADS, *(scene.removeprefix(SYNTHETIC) for scene in scenes)]
+    heads = ["Method", "component", "runs", *AREA_HEADS, *(scene.removeprefix(SYNTHETIC) for scene in scenes)]
     groups = [("", 3), ("over all runs", 2), ("ADD (%) by scene", len(scenes))]
-    how = "First line of a tracker: its areas under the curve. Below: with the component less without it, in points, "
+    how = "First line of a method: its areas under the curve. Below: with the component less without it, in points, "
     how += "and the 95 % interval of the mean by bootstrap over runs; bold where that leaves out 0"
     notes = [how, numbers.scored().capitalize(), *numbers.about()]
     return Table(numbers.plan.title, heads, lines, groups, words=2, rules=rules, notes=notes)

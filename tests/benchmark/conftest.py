@@ -10,7 +10,6 @@ PLAN = """
 title = "A board that slides"
 [[method]]
 name = "Ours"
-paper = "Ours"
 settings = {{ "method.surface" = false, "method.graph" = false }}
 [[method]]
 name = "No multi-hypothesis"

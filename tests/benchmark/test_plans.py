@@ -11,7 +11,7 @@ import pytest
 from p2p_lib.benchmark import execution, plan_names, read_plan
 from p2p_lib.benchmark.execution import measured
 from p2p_lib.benchmark.jobs import _present, jobs_of
-from p2p_lib.benchmark.plan import PROMPTS, PlannedSequence, prompts_file, prompts_places
+from p2p_lib.benchmark.plan import PROMPTS, Method, PlannedSequence, prompts_file, prompts_places
 from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
@@ -98,8 +98,21 @@ def test_the_papers_own_configuration_stands_in_every_table_beside_ours():
         for method in own:
             assert (method.preset, method.tracker, method.masks, method.gpu) == ("paper", "tapir", "sam2_video", True)
             assert method.detector == "superpoint" or "uniform" in method.name
-            beside = {other.paper for other in plan.method if other not in own}
-            assert not plan.paper or method.paper in beside, f"{name}: {method.name}"
+            assert not plan.paper or method.paper, f"{name}: {method.name}"
+
+
+def test_the_papers_figures_stand_beside_its_own_configuration_alone():
+    with pytest.raises(ValueError, match="paper = 'Ours': only with preset, tracker and masks paper, tapir"):
+        Method(name="a stand-in", paper="Ours", preset="paper", tracker="builtin2d")
+
+
+def test_a_configuration_has_one_name_in_all_tables():
+    named: dict[str, set[str]] = {}
+    for method in (method for name in PLANS for method in read_plan(name).method):
+        if method.name not in ("Ours, sensor noise", "Ours, the paper's files", "paper_full_files"):  # say of what data
+            same = method.model_dump_json(exclude={"name", "paper", "against", "gpu", "only", "but"})
+            named.setdefault(same, set()).add(method.name)
+    assert [names for names in named.values() if len(names) > 1] == []
 
 
 def test_weights_without_a_gpu_are_not_enough(monkeypatch):

@@ -35,7 +35,8 @@ def outcome(percent: float, frames: int = 10, **more) -> Outcome:
 def benchmark(tmp_path, results: dict, seeds=(0,), **plan) -> Benchmark:
     """results: (method, sequence) to an outcome per seed."""
     of = plan.pop("of", "Ours")
-    methods = {method: {"name": method, "paper": of} for method, _ in results}
+    own = {"paper": of, "preset": "paper", "tracker": "tapir", "masks": "sam2_video"}
+    methods = {method: {"name": method, **own} for method, _ in results}
     scope = {"seeds": list(seeds), "sequence": [{"name": "s"}]}
     made = Plan(name="p", title="A table", method=list(methods.values()), quick=scope, full=scope, **plan)
     jobs = []
@@ -150,13 +151,13 @@ def test_pairs_are_differences_run_against_run(tmp_path):
 
 def test_a_grid_has_a_row_per_sequence_and_the_mean_of_those_that_all_methods_ran(tmp_path):
     runs = {
-        ("paper, built-in", "bleach0"): [outcome(90), outcome(80)],
-        ("paper, built-in", "mustard0"): [outcome(70)] * 2,
+        ("Paper's text", "bleach0"): [outcome(90), outcome(80)],
+        ("Paper's text", "mustard0"): [outcome(70)] * 2,
     }
-    runs[("default, built-in", "bleach0")] = [outcome(99)] * 2
+    runs[("Ours, LK", "bleach0")] = [outcome(99)] * 2
     table = paper_table(benchmark(tmp_path, runs, seeds=(0, 1), kind="grid"))
-    assert list(table.heads) == ["Sequence", "built-in", "built-in"]
-    assert list(table.groups) == [("", 1), ("paper", 1), ("default", 1)]
+    assert list(table.heads) == ["Sequence", "built-in", "LK"]
+    assert list(table.groups) == [("", 1), ("Paper's text", 1), ("Ours", 1)]
     first, second, mean = [[cell.text for cell in row] for row in table.rows]
     assert first == ["ycbineoat/bleach0", "85.0 / 85.0 (0)", "99.0 / 99.0 (0)"]
     assert second == ["ycbineoat/mustard0", "70.0 / 70.0 (0)", "-"]
