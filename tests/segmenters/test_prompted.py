@@ -14,7 +14,7 @@ from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.patch import Box, Patch
-from p2p_lib.segmenters.builtin.prompted import Cut, Cutter
+from p2p_lib.segmenters.builtin.prompted import Cut, Cutter, _measured
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
 
@@ -187,6 +187,14 @@ def test_one_click_in_a_hole_of_the_depth_does_no_harm():
     frame.depth_m[95:106, 105:116] = 0
     clicks = Prompt("left", points_px=[[110, 100], [130, 120], [100, 125]]), Prompt("right", points_px=[[175, 110]])
     assert iou(segmenter().segment(frame, clicks) == 1, LEFT) > 0.9
+
+
+def test_a_click_beside_the_edge_that_has_no_depth_is_not_on_the_wall():
+    """In the shadow beside an edge most of what is measured around is the wall behind. With depth a click stays."""
+    frame = picture()
+    frame.depth_m[:, 89:92] = frame.depth_m[160:, 200:230] = 0
+    clicks = np.array([[89.0, 110], [87.0, 110], [120.4, 110], [215.0, 200]])
+    assert _measured(clicks, frame).tolist() == [[92, 110], [87, 110], [120.4, 110], [215, 200]]
 
 
 @pytest.mark.parametrize("wrong_px", [(0, 0, 0, 0), (-4, 3, 5, -2), (2, 2, -2, -2)])

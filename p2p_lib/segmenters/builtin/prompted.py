@@ -13,7 +13,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import bounds, nearest_px
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.cut import cut
@@ -57,6 +57,8 @@ _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
 #: Clicks may be close together on something large, or at the ends of something thin: the scales tried, as the object's
 #: extent over theirs. A cut's doubt is divided by the scale's value: the print inside an object has edges, too.
 _SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
+#: Depth is looked for this far from a click that has none, px; what differs by less is one surface, m.
+_HOLE_PX, _ONE_SURFACE_M = 3, 0.02
 #: A click on something else claims the cells of the grid within this radius.
 _AROUND_PX = 3
 
@@ -102,7 +104,7 @@ class Cutter:
     def cuts(self) -> list[Cut]:
         """From clicks or a box, at several scales, the least doubtful first."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
-        clicks = self.prompt.points_px
+        clicks = _measured(self.prompt.points_px, frame)
         if not len(clicks) and around_px is not None:
             clicks = points_in_box(around_px, frame)
         z_m = float(np.nanmedian(depths_at(clicks, frame)))
@@ -231,6 +233,20 @@ class Cutter:
         """A box with room around the pixels from ``low`` to ``high`` (x, y)."""
         half = (high - low) / 2 * (1 + 2 * self.config.margin) + ROOM_PX
         return around((low + high) / 2, half, self.frame.shape)
+
+
+def _measured(clicks_px: np.ndarray, frame: Frame) -> np.ndarray:
+    """Clicks (N, 2) on an object; those on pixels without depth are moved to the nearest pixel of the nearer surface.
+
+    Beside an object's edge, where one of a camera's two views is hidden, most of what is measured is the wall behind.
+    """
+    reach = np.mgrid[-_HOLE_PX : _HOLE_PX + 1, -_HOLE_PX : _HOLE_PX + 1].reshape(2, -1).T
+    reach = reach[np.argsort((reach**2).sum(1), kind="stable")]  # the pixel itself first
+    u, v = nearest_px(np.rint(clicks_px)[:, None] + reach, frame.shape)
+    z_m = np.where(frame.depth_m[v, u] > 0, frame.depth_m[v, u], np.inf)
+    near = np.isfinite(z_m) & (z_m < z_m.min(1, keepdims=True) + _ONE_SURFACE_M)
+    moved, rows, first = near.any(1) & np.isinf(z_m[:, 0]), np.arange(len(clicks_px)), near.argmax(1)
+    return np.where(moved[:, None], np.stack([u, v], -1)[rows, first], clicks_px)
 
 
 def _open(patch: Patch, side: np.ndarray, wrong: np.ndarray, right: np.ndarray) -> np.ndarray:
