@@ -13,6 +13,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin.patch import Box, Patch
 from p2p_lib.segmenters.builtin.prompted import Cut, Cutter, _measured
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
@@ -195,6 +196,16 @@ def test_a_click_beside_the_edge_that_has_no_depth_is_not_on_the_wall():
     frame.depth_m[:, 89:92] = frame.depth_m[160:, 200:230] = 0
     clicks = np.array([[89.0, 110], [87.0, 110], [120.4, 110], [215.0, 200]])
     assert _measured(clicks, frame).tolist() == [[92, 110], [87, 110], [120.4, 110], [215, 200]]
+
+
+def test_one_click_on_an_objects_edge_without_depth_selects_the_object():
+    """By a sensor's noise and shadows; around this pixel the wall alone is measured nearer by."""
+    video = open_sequence("synthetic/three_objects")
+    frame, block = video.frame(0), video.masks(0)["block"]
+    assert frame.depth_m[208, 601] == 0 and block[208, 601]
+    follow = BuiltinSegmenter(video.camera, preset().segmentation)
+    found = follow.segment(frame, [Prompt("block", points_px=[[601, 208]])]) == 1
+    assert iou(found, block) > 0.8
 
 
 @pytest.mark.parametrize("wrong_px", [(0, 0, 0, 0), (-4, 3, 5, -2), (2, 2, -2, -2)])
