@@ -28,7 +28,6 @@ from p2p_lib.datasets.alignment import misfit, moving_scale
 from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
-from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
@@ -286,7 +285,7 @@ def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None]
     if out_m and (wrong := beyond(out_m, limits, scale)):
         doubt(f"depth of {next(iter(out_m))!r} in frame {frame.index}", *wrong)
     for name in (name for name in away_m if name not in out_m and name not in known_m):
-        if wrong := odd_size(mask_length_m(frame, large[name], job.sequence.camera), away_m[name], scale):
+        if wrong := odd_size(large[name], away_m[name], job.sequence.camera, scale):
             doubt(f"size of {name!r} in frame {frame.index}", *wrong)
     return set(away_m)
 

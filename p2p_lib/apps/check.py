@@ -137,7 +137,7 @@ def check_folder(
             continue
         if name in sizes_m:
             findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
-        elif wrong_size := odd_size(mask_length_m(frame, mask, sequence.camera), distance_m(frame, mask), scale):
+        elif wrong_size := odd_size(mask, distance_m(frame, mask), sequence.camera, scale):
             findings.append(Finding(f"{name}: size", Level.LOOK, *wrong_size))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         findings.append(_range(name, frame, mask, config, scale))

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.image import bounds
 from p2p_lib.core.types import Frame
 
 #: Metres per unit of depth images in the field, likeliest first, and whose they are.
@@ -60,15 +62,18 @@ def beyond(away_m: Mapping[str, float], limits: DepthConfig, scale: float) -> tu
     return text, f"If it was, --set depth.{wider}; if it was not, {_wrong_scale(first_m, scale)}"
 
 
-def odd_size(length_m: float, away_m: float, scale: float) -> tuple[str, str] | None:
+def odd_size(mask: np.ndarray, away_m: float, camera: Camera, scale: float) -> tuple[str, str] | None:
     """What to say of an object so long, or so short, as nothing is that is tracked, and what to do; NaN: not measured.
 
-    length_m  of what its mask holds, at the distance away_m
+    mask  (H, W) bool: how long it is follows from its outline, at the distance away_m: depth is wild at edges
     """
+    rows, columns = bounds(mask)
+    sides_px = np.array([columns.stop - columns.start, rows.stop - rows.start])
+    length_m = float((sides_px / [camera.fx, camera.fy]).max() * away_m)
     if not (length_m < _LONG_M[0] or length_m > _LONG_M[1]):
         return None
     fix = f"If it is not, its mask is of something else, or {_wrong_scale(away_m, scale)}"
-    return f"{100 * length_m:.2g} cm long, {away_m:.2f} m away", fix
+    return f"{100 * length_m:.3g} cm long, {away_m:.2f} m away", fix
 
 
 def _wrong_scale(away_m: float, scale: float) -> str:

@@ -527,7 +527,7 @@ def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     *_, goes_on = followed(crossing, learnt.method, again)
     off = se3.inverse(goes_on["box"].T_cam_obj) @ told["box"].T_cam_obj
     assert np.linalg.norm(off[:3, 3]) < 0.004 and np.degrees(se3.angle_rad(off)) < 2
-    with pytest.raises(BadInput, match=r"Point2Pose\.save"):
+    with pytest.raises(BadInput, match=r"tracker\.save"):
         save_memory(tmp_path / "box.npz", learnt.memory)
         Point2Pose.load(tmp_path / "box.npz")
 

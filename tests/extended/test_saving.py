@@ -64,7 +64,7 @@ def test_a_segmenter_that_names_itself_by_what_is_installed_is_loaded_again(save
 
 def test_parts_that_were_named_by_their_place_are_loaded_again(saved):
     with saved(tracker="tests.extended.test_saving:Mine", detector="uniform") as loaded:
-        assert type(loaded.tracker).__name__ == "Mine" and loaded.detector.name == "uniform"
+        assert loaded.tracker.name == Mine.name and loaded.detector.name == "uniform"
 
 
 def test_a_part_that_was_an_instance_is_asked_for(saved, tmp_path):

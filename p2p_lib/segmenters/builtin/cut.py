@@ -19,6 +19,7 @@ from p2p_lib.segmenters.builtin.motion import Motions, parts_that_follow
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
     approximate_median,
+    components_touching,
     connected_components,
     dilated,
     plane_heights,
@@ -34,6 +35,8 @@ _STRANGE = -1.0
 _ON_SURFACE_M = 0.008
 #: A component may cover up to this share of the patch's border by accident.
 _AT_THE_BORDER = 0.02
+#: What was beside the object a frame ago by this share of it, is: flow moves a mask's outline by a cell or two.
+_MOST = 0.8
 #: Height in standard deviations of depth at which something stands out of its support.
 _STANDS_OUT = 2.0
 #: Points up to this height above the plane, besides noise, belong to it: its fit is no better.
@@ -55,14 +58,14 @@ def by_geometry(
     plane: np.ndarray | None,
     config: SegmentationConfig,
     motions: Motions | None = None,
-    fringe: float = 0.0,
+    beside: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence that an object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Returns the log-odds (h, w) and the
     component (h, w) bool that is connected with the seeds, empty unless it looks like one object. Parts beside it
-    that share its ``motions`` are added to it. Where seeds are as dense as a mask, components with fewer of them a cell
-    than the share ``fringe`` of those of the one with most are touched by accident, and are not of it.
+    that share its ``motions`` are added to it. What touches the seeds, but was seen a frame ago ``beside`` (h, w) bool
+    the object, is not of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -82,7 +85,9 @@ def by_geometry(
             log_odds[measured & low] -= config.geometry_weight
             free = free & ~low
     part = connected_components(free)
-    component = _components_held(part, seeds, fringe)
+    component = components_touching(part, seeds)
+    if beside is not None:
+        component &= ~_mostly(part, beside)
     if motions is not None:
         parts = parts_that_follow(patch, part, component, motions)
         component |= parts
@@ -95,12 +100,9 @@ def by_geometry(
     return log_odds, component
 
 
-def _components_held(part: np.ndarray, seeds: np.ndarray, fringe: float) -> np.ndarray:
-    """(h, w) bool: the components that hold seeds, but for those that no more than a ``fringe`` of them touches."""
-    size, held = np.bincount(part.ravel()), np.bincount(part[seeds], minlength=part.max() + 1)
-    held[0] = 0
-    density = held / np.maximum(size, 1)
-    return ((held > 0) & (density >= fringe * density[held.argmax()]))[part]
+def _mostly(part: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the components that lie mostly in a region (h, w) bool."""
+    return (np.bincount(part[region], minlength=part.max() + 1) > _MOST * np.bincount(part.ravel()))[part]
 
 
 def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: SegmentationConfig) -> np.ndarray:

@@ -18,8 +18,6 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 
 #: The flow is doubted if more of the mask jumped in depth, its area changed by more, or more of it lacks depth.
 _MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
-#: Flow moves the mask's outline a cell or two onto what lies beside: of that it covers less than this share.
-_FRINGE = 0.1
 #: Depth that returns after none of the object's was measured is its own within this distance of its last, m.
 _REAPPEARS_WITHIN_M = 0.1
 
@@ -30,6 +28,7 @@ class Prediction:
 
     jumped    (h, w) bool: its depth changed, so that something else has come before it or it has gone
     shown     (h, w) bool: it has depth now and had none, of the object or of what has come before it
+    beside    (h, w) bool: it was seen a frame ago, too, at the same depth and not in the mask
     left      whether the depth of most of it grew: it has not been covered but has left
     doubtful  whether the flow alone says too little
     """
@@ -38,6 +37,7 @@ class Prediction:
     prior: np.ndarray
     jumped: np.ndarray
     shown: np.ndarray
+    beside: np.ndarray
     left: bool
     doubtful: bool
 
@@ -61,13 +61,14 @@ def predict(view: View, target: Target) -> Prediction:
     was = before.down(image)
     prior, z_before = warped(was, before, patch)
     likely, measured, known = prior > 0.5, patch.depth_m > 0, z_before > 0
-    jumped = likely & measured & known & (np.abs(patch.depth_m - z_before) > patch.step_m)
+    steps = np.abs(patch.depth_m - z_before) > patch.step_m
+    jumped, beside = likely & measured & known & steps, ~likely & measured & known & ~steps
     shown = likely & measured & ~known
     area, blind = np.count_nonzero(likely), np.count_nonzero(likely & ~measured) + np.count_nonzero(shown)
     changed = abs(area - np.count_nonzero(was > 0.5)) > _MAX_AREA_CHANGE * area
     doubtful = changed or np.count_nonzero(jumped) > _MAX_JUMPED * area or blind > _MAX_UNMEASURED * area
     left = np.count_nonzero(jumped & (patch.depth_m > z_before)) > area / 2
-    return Prediction(patch, prior, jumped, shown, bool(left), bool(doubtful))
+    return Prediction(patch, prior, jumped, shown, beside, bool(left), bool(doubtful))
 
 
 def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: Prediction) -> Claim:
@@ -83,13 +84,16 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
     plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
     T_cam_obj = hint.T_cam_obj if target.confident else None
     motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
-    log_odds, component = by_geometry(patch, core, plane, cfg, motions, _FRINGE)
+    surface = by_surface(patch, hint, cfg, others)
+    known = T_cam_obj is not None and target.past.full
+    beside = predicted.beside & (surface <= 0) if known else None
+    log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside)
     stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
     # Parts that come into view are connected with those that were seen before.
     log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[jumped] -= cfg.geometry_weight
-    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + by_surface(patch, hint, cfg, others)
+    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + surface
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)

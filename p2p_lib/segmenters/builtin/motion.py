@@ -45,6 +45,11 @@ class Past:
 
     seen: tuple[tuple[Frame, np.ndarray], ...] = ()
 
+    @property
+    def full(self) -> bool:
+        """Whether the object has been followed for a while: its first masks may still grow."""
+        return len(self.seen) > _KEPT
+
     def due(self, frame: Frame) -> bool:
         """Whether a frame is to be remembered."""
         return not self.seen or frame.index >= self.seen[-1][0].index + EVERY
