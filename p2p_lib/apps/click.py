@@ -58,7 +58,7 @@ class Clicker(AbstractContextManager):
         if not 0 <= frame < len(sequence):
             raise BadInput("frame", frame, f"a number from 0 to {len(sequence) - 1}")
         self.sequence, self.path, self.first, self.run = sequence, Path(path), frame, run
-        self.prompts: tuple[Prompt, ...] = load_prompts(path) if self.path.is_file() else ()
+        self.prompts: tuple[Prompt, ...] = load_prompts(path) if self.path.is_file() else _of_run(run)
         self.image_png = lru_cache(maxsize=8)(self._image_png)
         self._finished, self._segmenting = Event(), Lock()
         try:
@@ -166,6 +166,13 @@ class Clicker(AbstractContextManager):
         if isinstance(content, dict) and content.get("finish"):
             self._finished.set()
         return ""
+
+
+def _of_run(run: Run | None) -> tuple[Prompt, ...]:
+    """What a run was started from, as far as it keeps that: of a mask it keeps the size alone."""
+    kept = (run.info.get("prompts") or ()) if run else ()
+    given = [entry for entry in kept if "mask_px" not in entry]
+    return parse_prompts({"objects": given}) if given else ()
 
 
 def first_change(before: Iterable[Prompt], after: Iterable[Prompt]) -> int | None:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from p2p_lib import __version__
 from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
-from p2p_lib.core.errors import Doubt, Doubts, P2PError, did_you_mean, in_a_line
+from p2p_lib.core.errors import Doubt, Doubts, P2PError, did_you_mean, doubt, in_a_line
 from p2p_lib.core.options import RunOptions, add_options
 from p2p_lib.core.plugins import is_place, offered
 
@@ -92,6 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name, doubts)
+            _doubt_outdated(getattr(arguments, "run", None))
             return arguments.command(arguments) or 0
     except BrokenPipeError:  # the reader of our output (head, less) has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -113,6 +114,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             warn(f"p2p {arguments.name}: {line}")
         if in_main:
             signal.signal(signal.SIGTERM, before)
+
+
+def _doubt_outdated(folder: Path | None) -> None:
+    """Say of an offline result that its run has gone on since, or was corrected."""
+    if folder is None:
+        return
+    from p2p_lib.datasets.runs import read_info
+
+    if not (read_info(folder) or {}).get("offline"):
+        return
+    from p2p_lib.offline.refine import outdated
+
+    if outdated(folder):
+        doubt(str(folder), "it was made of earlier poses of its run", f"Make it anew: p2p refine {folder.parent}")
 
 
 def _in_words(error: Exception, arguments: argparse.Namespace) -> str | None:

@@ -36,6 +36,8 @@ def _click(a: argparse.Namespace) -> None:
     check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale)
     shown = load_run(a.run) if a.run is not None else None
+    if shown is not None and (of := shown.info["sequence"]) != sequence.name:
+        warn(f"p2p click: {a.run} is a run of {of}, not of {sequence.name}: is it the right one?")
     page = Clicker(sequence, a.out, a.frame, a.port, shown)
     before = page.prompts
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)

@@ -96,8 +96,17 @@ def _stamp(folder: Path) -> dict[str, str]:
     code = hashlib.sha256(code_digest().encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
         code.update(path.read_bytes())
-    poses = hashlib.sha256((folder / "poses.npz").read_bytes())
-    return {"refined_from": poses.hexdigest(), "refined_by": code.hexdigest()[:12]}
+    return {"refined_from": _digest_of_poses(folder), "refined_by": code.hexdigest()[:12]}
+
+
+def _digest_of_poses(folder: Path) -> str:
+    return hashlib.sha256((folder / "poses.npz").read_bytes()).hexdigest()
+
+
+def outdated(folder: Path) -> bool:
+    """Whether this is an offline result beside a run that has other poses than those which it was made of."""
+    run, info = folder.resolve().parent, read_info(folder) or {}
+    return bool(info.get("offline")) and (run / "poses.npz").is_file() and info["refined_from"] != _digest_of_poses(run)
 
 
 # --- one object ----------------------------------------------------------------------------------

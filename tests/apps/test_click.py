@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from p2p_lib.apps import cli
 from p2p_lib.apps.click import PAGE, Clicker, first_change
 from p2p_lib.core.colours import OBJECTS
 from p2p_lib.core.errors import BadInput, MissingData
@@ -395,6 +396,24 @@ def test_the_masks_of_a_run_are_shown_to_be_mended(sequence, out, tmp_path):
     assert words[words.index("--prompts") + 1] == str(out) and words.count("--save-masks") == 1
     assert first_change(load_prompts(out), load_prompts(out)) is None
     assert first_change(load_prompts(out)[:1], load_prompts(out)) == 2
+
+
+def test_the_page_of_a_run_begins_with_what_the_run_was_started_from(sequence, out, tmp_path, capsys, monkeypatch):
+    """What is added to it goes on from there, also where the file of its prompts is not named again."""
+    board = np.zeros((H, W), bool)
+    board[20:40, 30:60] = True
+    made = [Prompt("board", 0, box_px=(29, 19, 60, 40)), Prompt("other", 1, mask=board)]
+    settings = {"method.surface": "false", "method.graph": "false"}
+    run(sequence, tmp_path / "run", prompts=made, settings=settings, progress=False)
+    with Clicker(sequence, out, run=load_run(tmp_path / "run")) as clicker:
+        assert clicker.session()["objects"] == [made[0].as_dict()], "of a mask its size alone is kept"
+    save_prompts(out, [Prompt("board", 2, points_px=[[40, 30]])])
+    with Clicker(sequence, out, run=load_run(tmp_path / "run")) as clicker:
+        assert [entry["frame"] for entry in clicker.session()["objects"]] == [2], "a file that is there counts"
+    monkeypatch.setattr("p2p_lib.apps.click.wait_for_clicks", lambda page, *_: page.prompts)
+    elsewhere = shutil.copytree(sequence.path, tmp_path / "elsewhere")
+    assert cli.main(["click", str(elsewhere), "--out", str(out), "--run", str(tmp_path / "run")]) == 0
+    assert "is a run of own, not of elsewhere: is it the right one?" in capsys.readouterr().err
 
 
 def test_the_server_says_what_mask_the_clicks_make(sequence, out):

@@ -308,7 +308,11 @@ def test_what_was_refined_already_is_left_as_it_is(tracked, as_they_were, monkey
     assert cli.main(words) == 0 and len(as_they_were) == 4 and written.stat().st_ino == before
     assert "left as it is; --force does it anew" in capsys.readouterr().out.splitlines()[0]
     with_covariances(tracked, "box")
-    assert cli.main(words) == 0 and len(as_they_were) == 6, "other poses"
+    said = f"it was made of earlier poses of its run. Make it anew: p2p refine {tracked}"
+    for at_last in (True, False):
+        assert cli.main(["film", str(tracked / "offline"), "--out", str(tracked / "film.gif")]) == 0
+        assert (said in capsys.readouterr().err) == at_last
+        assert cli.main(words) == 0 and len(as_they_were) == 6, "other poses"
     monkeypatch.setattr(offline, "code_digest", lambda: "another")
     assert cli.main(words) == 0 and len(as_they_were) == 8, "other code"
 
