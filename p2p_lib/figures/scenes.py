@@ -123,7 +123,7 @@ class Scene:
             image = overlay.draw_points(image, overlay.zoomed_px(dots[0], whole, camera), dots[1], 3)
         if not words:
             return image
-        caption = f"{self.sequence.name}  {frame.time_s - first.time_s[0]:.2f} s"
+        caption = f"{self.sequence.name}  frame {frame.index}  {frame.time_s - first.time_s[0]:.2f} s"
         caption += "  offline" * bool(self.run.info.get("offline"))
         return overlay.draw_labels(image, labels, caption)
 
