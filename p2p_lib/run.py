@@ -25,9 +25,11 @@ from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_t
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
+from p2p_lib.datasets.camera_check import odd_camera
 from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
+from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
@@ -103,7 +105,7 @@ def run(
     with waiting_for("Reading the sequence", progress), noted(doubts):
         job = _prepare(sequence, options, progress)
         sizes_m = lengths_m(options.sizes, job.objects)
-        _doubt_depth(job)
+        _doubt_camera(job)
         tracker = options.tracker
         if tracker == OracleTracker.name:  # which has to know the sequence
             tracker = OracleTracker(TrueScene.of(job.sequence, options.models), job.config.oracle, job.config.seed)
@@ -258,8 +260,10 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions, pro
     return _Job(source, config, sequence, frames, objects, masks, by_frame, memories)
 
 
-def _doubt_depth(job: _Job) -> None:
-    """Warn, before anything is tracked, where depth is not of one scale, or not registered to colour."""
+def _doubt_camera(job: _Job) -> None:
+    """Warn, before anything is tracked, where K is of other images, or depth not of one scale, or not registered."""
+    if wrong := odd_camera(job.sequence.camera):
+        doubt("camera", *wrong)
     looked_at = np.unique(np.linspace(job.frames[0], job.frames[-1] - 1, 8).astype(int)) if len(job.frames) > 1 else ()
     try:
         pairs = [(job.sequence.frame(int(i)), job.sequence.frame(int(i) + 1)) for i in looked_at]
@@ -450,6 +454,7 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     lines = [f"{count} of {wanted} frames" + (f" at {hz:.1f} Hz" if hz else "")]
     if left_out := run.info.get("left_out"):
         lines[0] += f"; {len(left_out)} left out, which cannot be read, the first: {next(iter(left_out.values()))}"
+    masks = load_masks(run.path)
     for name, obj in run.objects.items():
         without = zip(obj.status[~obj.has_pose], obj.reason[~obj.has_pose])
         why = Counter(_OTHER_MAP if s in WITH_POSE else status_text(s, r).partition(" since ")[0] for s, r in without)
@@ -457,7 +462,9 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
         most = f"; {otherwise} {why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
-        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}")
+        lengths_m = masks[name].size_m if name in masks else np.zeros(0)
+        long = f"; {100 * np.nanmedian(lengths_m):.3g} cm long by its masks" if np.isfinite(lengths_m).any() else ""
+        lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}{long}")
     return tuple(lines)
 
 

@@ -27,6 +27,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, evenly
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
+from p2p_lib.datasets.camera_check import odd_camera, sees
 from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size
 from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
 from p2p_lib.datasets.images import DEFAULT_HZ
@@ -39,12 +40,8 @@ from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
 FRAMES = 12
-#: Of the image's width: a principal point off centre.
-CENTRE_SHARE = 0.1
 #: Ranges in metres of whatever is recorded in front of a depth camera.
 NEAREST_M, FARTHEST_M = 0.05, 20.0
-#: Horizontal and vertical angles of view of any RGB-D camera.
-VIEW_DEG = (20.0, 130.0)
 #: Frames per second that cameras have, and a gap as a multiple of the usual interval.
 RATES_HZ, GAP = (0.5, 500.0), 10.0
 #: Fraction of images that may equal the next one.
@@ -218,24 +215,11 @@ def _files(folder: Path) -> list[Finding]:
 
 
 def _camera(camera: Camera) -> Finding:
-    """Whether K belongs to images of this size: its principal point is about their middle."""
-    size, centre = np.array([camera.width, camera.height]), np.array([camera.cx, camera.cy]) + 0.5
-    view_deg = np.degrees(2 * np.arctan(size / 2 / [camera.fx, camera.fy]))
-    text = f"sees {view_deg[0]:.0f} x {view_deg[1]:.0f} degrees, centre at ({camera.cx:.0f}, {camera.cy:.0f})"
-    if (np.abs(centre / size - 0.5) > CENTRE_SHARE).any():
-        of = "x".join(f"{round(2 * c, -1):.0f}" for c in centre)
-        text = f"K has its centre at ({camera.cx:.0f}, {camera.cy:.0f}): that of images of about {of}"
-        factors = size / (2 * centre)
-        fix = f"Take K at {camera.width}x{camera.height}"
-        if abs(factors[0] / factors[1] - 1) < 0.1:
-            fix += f": for images scaled as a whole, its first two rows times {factors.mean():.3g}"
-        return Finding("camera", Level.WRONG, text, f"{fix}.")
-    if (view_deg < VIEW_DEG[0]).any() or (view_deg > VIEW_DEG[1]).any():
-        fix = "fx and fy are in pixels, at the size that the images have here."
-        return Finding("camera", Level.WRONG, f"{text}: no RGB-D camera does", fix)
-    return Finding(
-        "camera", Level.OK, f"{text}; images cannot tell whether fx and fy are right: a known size can, {_KNOWN}"
-    )
+    """Whether K belongs to images of this size."""
+    if wrong := odd_camera(camera):
+        return Finding("camera", Level.WRONG, *wrong)
+    text = f"{sees(camera)}; images cannot tell whether fx and fy are right: a known size can, {_KNOWN}"
+    return Finding("camera", Level.OK, text)
 
 
 def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Camera) -> Finding:

@@ -45,10 +45,13 @@ def gaps_allowed(allowed: bool = True) -> Iterator[None]:
 
 def paired_depth(files: tuple[Path, ...], rgb: tuple[Path, ...]) -> tuple[Path, ...]:
     """The depth image of each colour image, by their names where some are missing and :func:`gaps_allowed` says so."""
-    by_name = {path.stem: path for path in files}
-    if _gaps.get() and len(files) < len(rgb) and by_name.keys() <= {path.stem for path in rgb}:
+    by_name, names = {path.stem: path for path in files}, {path.stem for path in rgb}
+    if _gaps.get() and len(files) < len(rgb) and by_name.keys() <= names:
         return tuple(by_name.get(path.stem, files[0].with_stem(path.stem)) for path in rgb)
-    return check_paired(files, rgb, SKIP_BAD if len(files) < len(rgb) else "")
+    hint = "" if len(files) >= len(rgb) else SKIP_BAD
+    if hint and (other := next((path.name for path in files if path.stem not in names), "")):
+        hint = f"Which belong together, names do not say: {other} is that of no colour image, as {rgb[0].name}."
+    return check_paired(files, rgb, hint)
 
 
 def first_readable(files: Sequence[Path], read: Callable[[Path], np.ndarray]) -> np.ndarray:
@@ -193,7 +196,10 @@ def read_raw_depth(path: Path) -> np.ndarray:
     else:
         raw = read_image(path, cv2.IMREAD_UNCHANGED, "a 16-bit depth image")
     if raw.ndim != 2 or raw.dtype not in (np.uint16, np.float32):
-        raise BadInput(str(path), f"{raw.shape} {raw.dtype}", "one channel, uint16 or float32")
+        colours = raw.dtype == np.uint8 and raw.ndim == 3
+        fix = "These are colours: are colour and depth images swapped?" if colours else ""
+        fix = fix or "8 bits hold no depth: save 16-bit images." * (raw.dtype == np.uint8)
+        raise BadInput(str(path), f"{raw.shape} {raw.dtype}", "one channel, uint16 or float32", fix)
     return raw
 
 

@@ -242,7 +242,7 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
     folder = Path(folder)
     info = read_info(folder)
     if info is None:
-        raise MissingData(str(folder), "no run there (no run.json)", f"Make one: p2p run SEQ --out {folder}")
+        raise MissingData(str(folder), "no run there (no run.json)", "Make one: p2p run SEQ --out DIR")
     arrays, objects = load_arrays(folder / "poses.npz"), {}
     for name in info["objects"] if info["frames"] else ():
         if f"{name}/frame_index" in arrays:

@@ -951,7 +951,12 @@ def test_a_folder_of_ones_own_may_have_masks_of_some_images(sequence, tmp_path, 
     for k in (0, 4):
         cv2.imwrite(str(own / "masks" / "board" / f"{k:04d}.png"), truth(k).astype(np.uint8))
     assert run(own, tmp_path / "out") == 0
-    assert "board: a pose in 8 of 8 frames" in capsys.readouterr().out
+    assert re.search(r"board: a pose in 8 of 8 frames; \d+(\.\d)? cm long by its masks", capsys.readouterr().out)
+    K = np.loadtxt(own / "cam_K.txt")
+    np.savetxt(own / "cam_K.txt", K * [[2], [2], [1]])
+    assert run(own, tmp_path / "other", "--stop", "1") == 0
+    assert "p2p run: camera: K has its centre at" in capsys.readouterr().err
+    np.savetxt(own / "cam_K.txt", K)
     assert run(own, tmp_path / "out", "--start", "1", "--stop", "4") == 2
     assert "none in frames 1 to 3" in capsys.readouterr().err
 

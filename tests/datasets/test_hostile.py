@@ -19,6 +19,7 @@ from p2p_lib.benchmark.plan import read_plan
 from p2p_lib.core import files
 from p2p_lib.core.config import from_toml
 from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.datasets import images
 from p2p_lib.datasets.archives import unpack
 from p2p_lib.datasets.exchange import _bop_rows
 from p2p_lib.datasets.images import read_numbers, read_raw_depth, read_rgb
@@ -334,3 +335,14 @@ def test_limits_are_above_what_is_real():
     assert files.LARGEST_IMAGE_PX > 7680 * 4320
     with pytest.raises(BadInput):
         files.file_name("name", "../x")
+
+
+def test_depth_images_that_are_named_otherwise_than_colour_ones_are_not_guessed(tmp_path):
+    """With --skip-bad, too: which of them are missing, nobody knows."""
+    rgb = tuple(tmp_path / f"{k:06d}.jpg" for k in range(3))
+    depth = (tmp_path / "d0.png", tmp_path / "d1.png")
+    for allowed in (False, True):
+        with images.gaps_allowed(allowed), pytest.raises(BadInput) as refused:
+            images.paired_depth(depth, rgb)
+        assert "d0.png is that of no colour image, as 000000.jpg" in str(refused.value)
+        assert "--skip-bad" not in str(refused.value)

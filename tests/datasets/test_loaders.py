@@ -79,7 +79,12 @@ FAULTS = {
     "depth of eight bits": (
         "depth/0001.png",
         np.zeros((H, W), np.uint8),
-        r"depth/0001\.png: got \(30, 40\) uint8, expected one channel, uint16",
+        r"depth/0001\.png: got \(30, 40\) uint8, expected one channel, uint16.*8 bits hold no depth: save 16-bit",
+    ),
+    "colour in the place of depth": (
+        "depth/0001.png",
+        np.zeros((H, W, 3), np.uint8),
+        r"expected one channel, uint16 .*These are colours: are colour and depth images swapped\?",
     ),
     "depth in colour": (
         "depth/0001.png",
