@@ -120,7 +120,8 @@ def _run(a: argparse.Namespace) -> int:
     result = run(a.sequence, a.out, options, **how)
     print("\n".join([*result.summary, *_without_map(a.out)]))
     if result.look_at:
-        print("\n".join(["What to look at before it is believed:", *(f"  {line}" for line in result.look_at)]))
+        title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
+        print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
     if result.evaluation is not None:
         print(result.evaluation.as_table())
         print(f"Results in {a.out}. Next: p2p eval {a.out} --json")

@@ -1020,7 +1020,7 @@ def test_what_is_suspicious_is_said_at_the_end_kept_and_said_again(sequence, tmp
     told = json.loads((out / "run.json").read_text())
     assert any("clicks on 'wall' in frame 0" in text for text in told["doubts"])
     assert told["doubts"][0] in told["look_at"]["wall"]
-    assert "What to look at before it is believed:" in said
+    assert "What to look at before it is believed, by some of the images" in said
     assert all(f"  wall: {text}" in said for text in told["look_at"]["wall"])
     assert cli.main(["eval", str(out), "--json"]) == 0
     judged = json.loads(capsys.readouterr().out)["objects"]["wall"]
