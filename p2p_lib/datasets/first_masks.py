@@ -49,11 +49,12 @@ class FirstMasks:
         again = {name: mask for name, mask in seen.items() if name in self._followed & now}
         self._followed |= new.keys()
         self._started = list(dict.fromkeys([*self._started, *new]))
+        colours = object_colours(dict.fromkeys([*(prompt.name for prompt in self._prompts), *self._started]))  # a run's
         for title, drawn, panels in (("first", new, self._panels), ("corrected", again, self._corrected)):
             if drawn:
                 prompts = [newest[name] for name in drawn if name in newest]
                 title = f"{title} masks, frame {frame.index}"
-                panels.append(_panel(frame, drawn, prompts, object_colours(self._started), title))
+                panels.append(_panel(frame, drawn, prompts, colours, title))
         del self._corrected[:-_CORRECTIONS]
         if new or again:
             sheet = [*self._panels, *self._corrected]

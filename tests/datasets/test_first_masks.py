@@ -91,3 +91,11 @@ def test_corrections_are_drawn_below_the_newest_ones_of_many(tmp_path):
     many = read(path)
     np.testing.assert_array_equal(many[: len(image)], image)
     assert len(many) == 13 * len(image) and (many[12 * len(image) + 59, 60:90] == cup).all()
+
+
+def test_objects_have_the_colours_of_the_order_of_their_prompts(tmp_path):
+    """As in the rest of a run, whichever of them is seen first."""
+    path, said = tmp_path / "first.png", [Prompt("cup", 3, [[65, 65]]), Prompt("box", 0, [[10, 40]])]
+    FirstMasks(path, said).add(picture(0), {"box": square(30, 0)})
+    first, second = ((read(path) == np.array(rgb(colour))).all(-1).any() for colour in OBJECTS[:2])
+    assert second and not first
