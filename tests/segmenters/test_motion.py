@@ -9,6 +9,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin import following
 from p2p_lib.segmenters.builtin.cut import by_geometry
 from p2p_lib.segmenters.builtin.motion import Motions, Past, agrees, parts_that_follow, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, components_touching, connected_components
@@ -149,6 +150,28 @@ def test_what_the_mask_touches_but_was_beside_it_a_frame_ago_is_not_taken_in():
     for beside, taken in ((part & ~seeds, False), (part & (np.arange(part.shape[1]) % 2 == 0), True), (None, True)):
         _, component = by_geometry(patch, seeds, None, CONFIG, beside=beside)
         assert component[plate].all() and component[part].all() == component[part].any() == taken
+
+
+@pytest.mark.parametrize("on_surface", [True, False])
+def test_what_lies_beside_counts_once_the_masks_are_settled_and_off_the_surface(on_surface, monkeypatch):
+    """First masks may still grow; what is on the object's surface is of it, wherever the mask was."""
+    told, inner = {}, following.by_geometry
+
+    def by_geometry_noted(patch, seeds, plane, config, motions=None, beside=None):
+        told[k] = None if beside is None else bool(beside.any())
+        return inner(patch, seeds, plane, config, motions, beside)
+
+    monkeypatch.setattr(following, "by_geometry", by_geometry_noted)
+    segmenter = BuiltinSegmenter(CAMERA, CONFIG)
+    clicks = [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
+    points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
+    surface_m = np.zeros((240, 320), np.float32) if on_surface else None
+    for k in range(45):
+        moved_m = 0.001 * k
+        hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], surface_m, left(moved_m))
+        segmenter.segment(scene(k, moved_m), () if k else clicks, {"it": hint} if k else None)
+    early, late = ([told[k] for k in told if lo <= k < hi] for lo, hi in ((1, 25), (40, 45)))
+    assert early and set(early) == {None} and late and set(late) == {not on_surface}
 
 
 @pytest.mark.parametrize("part_moves", [True, False])
