@@ -134,7 +134,8 @@ def run_notebooks(
     # The long ones are among the last, and what begins last should be short: in the end it runs alone.
     order = plans if jobs == 1 else plans[::-1]
     runs = {
-        path: pool.submit(_run_one, path, home, values, _kernel_manager(places, kernels), say) for path, values in order
+        path: pool.submit(_run_one, path, home, values, _kernel_manager(path.parent, places, kernels), say)
+        for path, values in order
     }
     try:
         for path in paths:
@@ -246,7 +247,6 @@ def _run_one(
             source,
             executed,
             parameters=values,
-            cwd=source.parent,
             kernel_name="python3",
             kernel_manager_class=kernel_manager,
             progress_bar=False,
@@ -258,8 +258,8 @@ def _run_one(
     return result
 
 
-def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
-    """A manager whose kernels talk over private sockets (over TCP they warn) and know the folders of this run.
+def _kernel_manager(folder: Path, places: Mapping[str, Path], kernels: list[Any]) -> type:
+    """A manager whose kernels run in a folder, talk over private sockets (TCP warns) and know this run's places.
 
     Each joins ``kernels`` when started, so that all can be ended at once.
     """
@@ -284,7 +284,9 @@ def _kernel_manager(places: Mapping[str, Path], kernels: list[Any]) -> type:
         async def start_kernel(self, **options: Any) -> None:  # type: ignore[override]
             # What a cell raises is in the notebook; a kernel logs besides that it was interrupted when it is shut down.
             quiet = [*options.pop("extra_arguments", ()), "--log-level=CRITICAL"]
-            await super().start_kernel(**options | {"extra_arguments": quiet, "env": {**os.environ, **environment}})
+            # Papermill's own cwd moves the whole process there and back, which two notebooks at a time get in a tangle.
+            options |= {"extra_arguments": quiet, "env": {**os.environ, **environment}, "cwd": str(folder.resolve())}
+            await super().start_kernel(**options)
             kernels.append(self)
 
         def kill(self) -> None:

@@ -233,9 +233,11 @@ def run(tmp_path_factory):
     fails = CHECKS.replace('"its name"', '"its name"),\n    Claim("AUC [%]", 12.34, "of ADD-S", at_least=95')
     write(folder / "01_fails.ipynb", checks=fails)
     write(folder / "02_last.ipynb")
-    lines = []
-    with pytest.raises(NotebookFailed) as failed:
+    lines, moved, chdir = [], [], os.chdir
+    with pytest.raises(NotebookFailed) as failed, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "chdir", lambda path: (moved.append(Path(path).resolve()), chdir(path)))
         run_notebooks("quick", out=out, folder=folder, jobs=2, parameters={"SEED": "3", "SCALE": 2}, say=lines.append)
+    assert set(moved) <= {Path.cwd()}, "threads have one working directory between them"
     return folder, out, failed.value, lines
 
 
