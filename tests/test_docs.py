@@ -25,7 +25,8 @@ from p2p_lib.datasets.sequence import open_sequence
 from studies.runner import list_notebooks
 
 PROJECT = Path(__file__).resolve().parents[1]
-DOCUMENTS = ("README.md", "CONTRIBUTING.md", "environment.md")
+GUIDES = tuple(f"docs/{path.name}" for path in sorted((PROJECT / "docs").glob("*.md")))
+DOCUMENTS = ("README.md", "CONTRIBUTING.md", "environment.md", *GUIDES)
 #: Where a file named in passing may lie.
 PLACES = ("", "p2p_lib", *(str(p.relative_to(PROJECT)) for p in sorted((PROJECT / "p2p_lib").glob("*/"))), "notebooks")
 
@@ -83,7 +84,12 @@ def test_what_docstrings_refer_to_exists():
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_links_lead_somewhere(name):
     links = [link for link in re.findall(r"\]\(([^)#]+)[^)]*\)", read(name)) if "://" not in link]
-    assert not [link for link in links if not (PROJECT / link).exists()]
+    assert not [link for link in links if not (PROJECT / name).parent.joinpath(link).exists()]
+
+
+def test_readme_leads_to_every_guide_and_is_read_in_some_minutes():
+    assert GUIDES and not [name for name in GUIDES if f"]({name}" not in read("README.md")]
+    assert len(read("README.md").split()) < 2500, "what one has to look up belongs in a guide"
 
 
 def test_pages_lead_to_pages_and_dead_links_are_found(tool, tmp_path):
@@ -103,9 +109,9 @@ def test_pages_lead_to_pages_and_dead_links_are_found(tool, tmp_path):
 
 def test_the_page_of_the_lines_says_what_each_status_means(tool, tmp_path):
     tool("docs").json_lines(tmp_path)
-    page = (tmp_path / "json_lines.html").read_text()
-    assert "as of an estimate, below" in page
-    _, _, below = page.partition("as of an estimate, below")
+    page = (tmp_path / "docs/json_lines.html").read_text()
+    assert 'as <a href="python.html#estimates">of an estimate</a>' in page
+    _, _, below = page.partition('<h2 id="estimates">')
     assert not [status for status in Status if f"<code>{status}</code>" not in below]
 
 
@@ -216,8 +222,18 @@ def test_the_example_camera_is_played_live(tmp_path, monkeypatch, capsys):
         assert waits.result(20) is None
 
 
-def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
-    """All blocks, one after the other, as they stand, but for ``video``: a printed card that slides by."""
+def python_of(name: str) -> str:
+    """The blocks of Python of a document, one after the other."""
+    return "".join(re.findall(r"```python\n(.*?)```", read(name), re.DOTALL))
+
+
+def test_the_python_of_the_readme_runs(capsys):
+    exec(python_of("README.md"), names := {})
+    assert names["estimate"].status is Status.TRACKED and "tracked" in capsys.readouterr().out
+
+
+def test_the_page_on_python_runs(tmp_path, monkeypatch):
+    """All blocks as they stand, but for ``video``: a printed card that slides by."""
     monkeypatch.chdir(tmp_path)
     print_ = np.kron(np.random.default_rng(0).integers(0, 255, (20, 25, 3)), np.ones((8, 8, 1))).astype(np.uint8)
     video = []
@@ -227,8 +243,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
         rgb[part], depth_mm[part] = print_, 600
         video.append((rgb, depth_mm))
     names: dict = {"video": video}
-    blocks = "".join(re.findall(r"```python\n(.*?)```", read("README.md"), re.DOTALL))
-    source, emptied = re.subn(r"(?m)^video: .* = \[\].*\n", "", blocks)
+    source, emptied = re.subn(r"(?m)^video: .* = \[\].*\n", "", python_of("docs/python.md"))
     assert emptied == 1
     exec(source, names)
     assert names["estimates"]["mug"].status is Status.TRACKED

@@ -197,7 +197,7 @@ def test_every_extra_is_known_and_said():
     assert everything.extras == declared - {"sam2", "sam2-video"}
     page = (PROJECT / "environment.md").read_text()
     (row,) = re.findall(r"(?m)^\| `open3d` \| .*", page)
-    written = dict(re.findall(r"(?m)^\| `([\w-]+)` \| (a .*)", (PROJECT / "README.md").read_text()))
+    written = dict(re.findall(r"(?m)^\| `([\w-]+)` \| (a .*)", (PROJECT / "docs/models_and_labels.md").read_text()))
     for product in {*PRODUCTS} - {"bop-dataset"}:  # what has a textured model
         assert all(product in said for said in (EXTRAS["open3d"], row)), product
         assert "Needs the extra `open3d`" in written[product]

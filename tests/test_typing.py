@@ -1,4 +1,4 @@
-"""Type checkers find the library where it is installed to be edited, and README's examples are sound as they stand."""
+"""Type checkers find the library where it is installed to be edited, and the documents' examples are sound."""
 
 import os
 import re
@@ -63,8 +63,9 @@ def test_a_script_sees_the_types_of_an_editable_install(edited, tmp_path):
     assert "Found 3 errors" in said
 
 
-def test_the_python_of_the_readme_is_sound_and_what_it_guards_against_is_reported(tmp_path):
-    blocks = re.findall(r"```python\n(.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)
+def test_the_python_of_the_documents_is_sound_and_what_it_guards_against_is_reported(tmp_path):
+    pages = [(PROJECT / name).read_text() for name in ("README.md", "docs/python.md")]
+    blocks = re.findall(r"```python\n(.*?)```", "\n".join(pages), re.DOTALL)
     found = {}
     for name, guard in (("readme", "if model.surface is not None:"), ("unguarded", "if True:")):
         path = tmp_path / f"{name}.py"

@@ -46,7 +46,7 @@ _PAGE = """<!doctype html>
 </html>
 """
 #: What every page leads to, from the top folder.
-_FIRST = {"README": "README.html", "environment": "environment.html", "JSON lines": "json_lines.html"}
+_FIRST = {"README": "README.html", "environment": "environment.html", "JSON lines": "docs/json_lines.html"}
 _FIRST |= {"contributing": "CONTRIBUTING.html", "changes": "CHANGELOG.html", "reference": "p2p_lib.html"}
 
 
@@ -117,22 +117,24 @@ def _write(out, name, title, text):
 
 
 def json_lines(out):
-    """What README says of the lines, and two of them as they are written."""
+    """What the guides say of the lines, and two of them as they are written."""
     from p2p_lib.apps.live import json_line
     from p2p_lib.apps.live_words import Words
     from p2p_lib.core import se3
     from p2p_lib.core.types import PoseEstimate, Status
 
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    said = re.search(r"### A camera\n(.*?)\n###? ", readme, re.DOTALL)[1]
-    said += re.search(r"\nAn estimate has a `T_cam_obj` only if.*?\n(?=\n)", readme, re.DOTALL)[0]  # "below"
+    said = ""
+    for page, part in (("user_guide", "A camera"), ("python", "Estimates")):
+        text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+        said += re.search(rf"\n## {part}\n.*?\n(?=## )", text, re.DOTALL)[0]
     T_cam_obj = se3.exp(np.array([0, 0, 0, 0.1, 0.0, 0.6])).round(3)
     seen = PoseEstimate("mug", 31, 1.033, Status.TRACKED, T_cam_obj, 0.93, np.diag([4.0, 4, 9, 1, 1, 1]) * 1e-6)
     gone = PoseEstimate("mug", 32, 1.067, Status.OCCLUDED, reason="not found since frame 32")
     lines = "\n\n".join(f"```json\n{json_line(estimate)}\n```" for estimate in (seen, gone))
     title, words = "Lines of JSON", Words.__doc__.replace("``", "`").replace("    ", "")
-    text = f"# {title}\n\n{said}\n\n## Out\n\n{lines}\n\n## In\n\n{re.sub(r':meth:', '', words)}\n"
-    _write(out, "json_lines.html", title, text)
+    said = _turned(said, "docs/json_lines.md", [])
+    text = f"# {title}\n{said}\n## Out\n\n{lines}\n\n## In\n\n{re.sub(r':meth:', '', words)}\n"
+    _write(out, "docs/json_lines.html", title, text)
 
 
 def _share(out):
