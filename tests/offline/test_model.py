@@ -17,6 +17,7 @@ from p2p_lib.core.raycasting import SurfaceDistance
 from p2p_lib.core.types import evenly
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
 from p2p_lib.offline import holes, model, texture
+from p2p_lib.offline.finished import Finished, Renderer
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -320,6 +321,19 @@ def test_a_texture_that_is_no_better_than_vertex_colours_is_told(finished, tmp_p
     assert "texture of 1 view," in told
     assert ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)" in told
     assert model.no_better({"texture": 9.0, "vertex_colours": 15.5}) == ""
+
+
+def test_a_model_that_lacks_a_part_is_told(finished):
+    """None, a tenth and three tenths of a box are cut off."""
+    whole, made = trimesh.load(finished / "meshes/box.ply"), Finished.of(finished)
+    axis, shares = int(np.argmax(np.ptp(whole.bounds, axis=0))), []
+    for cut in (0.0, 0.1, 0.3):
+        vertices, top = whole.vertices.copy(), whole.bounds[1, axis] - cut * np.ptp(whole.bounds[:, axis])
+        vertices[:, axis] = np.minimum(vertices[:, axis], top)
+        render = Renderer(vertices, whole.faces, made.sequence.camera)
+        shares.append(model.beside(made, "box", np.arange(0, len(made.frames), 4), render))
+    assert shares[0] == 0 and shares[0] < shares[1] < shares[2]
+    assert model.lacks(shares[0]) == "" and "lacks a part" in model.lacks(shares[2])
 
 
 def test_a_surface_is_cleaned_of_what_no_object_has():
