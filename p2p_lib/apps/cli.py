@@ -29,6 +29,7 @@ from p2p_lib.apps.command_line import (
     command,
     main,
     open_page,
+    output,
     run_options,
     warn,
 )
@@ -45,11 +46,8 @@ _FILES = (
     "poses as bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR);"
     " bop-dataset: labelled images, masks and models; foundationpose: images, first mask, mesh; model: textured meshes"
 )
-_OVERLAY = arg(
-    "--overlay",
-    type=Path,
-    metavar="FILE",
-    help="besides a film of it: .mp4, or a .gif or .webp at most 480 px wide (see p2p film)",
+_OVERLAY = output(
+    "FILE", "besides a film of it: .mp4, or a .gif or .webp at most 480 px wide (see p2p film)", "--overlay"
 )
 _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
 _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
@@ -75,7 +73,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     ),
     arg("--jobs", type=int, metavar="N", help="recordings of --batch at a time (default: one a core)"),
     arg("--scheduler", metavar="tcp://HOST:PORT", help="for --batch: a Dask cluster that sees DIR"),
-    arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
+    output("DIR", "folder for the results", required=True),
     _FORCE,
     arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
     arg(
@@ -169,7 +167,7 @@ def _without_map(run: Path) -> list[str]:
         help="lines of JSON on standard input add, correct and remove objects; their frame is the next one",
     ),
     arg("--click", action="store_true", help="a page on the newest image adds, corrects and removes objects"),
-    arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
+    output("DIR", "folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
     NO_BROWSER,
@@ -320,13 +318,13 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     "run methods on sequences with seeds as a plan says; resumes",
     arg("plan", nargs="*", metavar="PLAN", help="TOML files, or names that --list shows"),
     arg("--list", action="store_true", help="what can run here and now; of PLAN: what it lacks"),
-    arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
+    output("DIR", "runs, records and tables; several plans may share it"),
     arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
     arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
     arg("--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster that sees DIR; trust who can reach it"),
     arg("--retry", action="store_true", help="try again what failed before"),
     arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
-    arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
+    output("DIR", "tables with notes of what they are of go here, too", "--tables"),
     arg("--stale", action="store_true", help="what of figures/ is of earlier code: marked so, with --out made anew"),
     QUIET,
 )
@@ -397,12 +395,11 @@ def _stale(a: argparse.Namespace) -> int:
 @command(
     "figures",
     "draw the paper's qualitative figures and write the index of all its figures and tables",
-    arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
-    arg(
+    output("DIR", "runs, found again the next time (default out/benchmark)"),
+    output(
+        "DIR",
+        "pictures and their index go here, over those there (default $P2P_FIGURES, else figures/ of the clone)",
         "--figures",
-        type=Path,
-        metavar="DIR",
-        help="pictures and their index go here, over those there (default $P2P_FIGURES, else figures/ of the clone)",
     ),
     arg("--only", metavar="fig1_three_objects,runtime", help="these pictures alone, by their names"),
     arg(
@@ -454,7 +451,7 @@ def _refine(a: argparse.Namespace) -> None:
     "write a run's poses as BOP, TUM or a dataset keeps them, a labelled dataset, or textured models",
     _RUN,
     arg("--format", required=True, choices=("bop", "tum", "poses", *PRODUCTS), help=_FILES),
-    arg("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the files"),
+    output("DIR", "a new or empty folder for the files", required=True),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
     arg("--min-confidence", type=float, metavar="C", help="leave less confident poses out (default 0, of labels 0.5)"),
     arg("--faces", type=int, default=5000, metavar="N", help="of a textured model, at most (default 5000)"),
@@ -482,7 +479,7 @@ def _export(a: argparse.Namespace) -> None:
     "view",
     "look at a run in 3D with a time slider, in the browser",
     _RUN,
-    arg("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else"),
+    output("FILE", "the page (default DIR/view.html); it needs nothing else"),
     NO_BROWSER,
 )
 def _view(a: argparse.Namespace) -> None:
@@ -497,7 +494,7 @@ def _view(a: argparse.Namespace) -> None:
     "film",
     "write a run as a film: boxes, axes, statuses, keypoints, masks",
     _RUN,
-    arg("--out", type=Path, metavar="FILE", help=".mp4, .gif or .webp (default DIR/film.mp4)"),
+    output("FILE", ".mp4, .gif or .webp (default DIR/film.mp4)"),
     arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF or WebP)"),
 )
 def _film(a: argparse.Namespace) -> None:
@@ -517,7 +514,7 @@ def _film(a: argparse.Namespace) -> None:
     arg("--only", metavar="00,03", help="only these notebooks"),
     arg("--jobs", type=int, default=1, metavar="N", help="notebooks at a time"),
     arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
-    arg("--out", type=Path, metavar="DIR", help="folder of results (default out/PROFILE; with --parameter beside it)"),
+    output("DIR", "folder of results (default out/PROFILE; with --parameter beside it)"),
 )
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study

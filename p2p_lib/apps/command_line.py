@@ -17,13 +17,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tqdm import tqdm
 
 from p2p_lib import __version__
 from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
-from p2p_lib.core.errors import Doubt, Doubts, P2PError, did_you_mean, doubt, in_a_line
+from p2p_lib.core.errors import BadInput, Doubt, Doubts, P2PError, did_you_mean, doubt, in_a_line
 from p2p_lib.core.options import RunOptions, add_options
 from p2p_lib.core.plugins import is_place, offered
 
@@ -44,6 +45,16 @@ _COMMANDS: list[tuple[str, str, tuple[Argument, ...], Callable]] = []  # name, h
 def arg(*flags: str, **how: Any) -> Argument:
     """What ``add_argument`` takes."""
     return lambda parser: parser.add_argument(*flags, **how)
+
+
+def output(metavar: str, help: str, flag: str = "--out", **how: Any) -> Argument:
+    """A folder (``metavar`` DIR) or a file that a command writes: one that cannot be is refused before it begins."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        written = parser.add_argument(flag, type=Path, metavar=metavar, help=help, **how)
+        parser.set_defaults(outputs=[*(parser.get_default("outputs") or ()), written])
+
+    return add
 
 
 def run_options(*wanted: str, **helps: str) -> Argument:
@@ -92,6 +103,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name, doubts)
+            for of in getattr(arguments, "outputs", ()):
+                check_writable(of.option_strings[0], getattr(arguments, of.dest), of.metavar == "DIR")
             _doubt_outdated(getattr(arguments, "run", None))
             return arguments.command(arguments) or 0
     except BrokenPipeError:  # the reader of our output (head, less) has gone
@@ -114,6 +127,24 @@ def main(argv: Sequence[str] | None = None) -> int:
             warn(f"p2p {arguments.name}: {line}")
         if in_main:
             signal.signal(signal.SIGTERM, before)
+
+
+def check_writable(option: str, path: Path | None, folder: bool) -> None:
+    """Refuse a folder, or else a file, that could not be written in the end, before anyone works or waits for it."""
+    if path is None:
+        return
+    what, kinds = f"{option} {path}", ("a folder", "a file")[:: 1 if folder else -1]
+    try:
+        if path.exists() and path.is_dir() != folder:
+            raise BadInput(what, kinds[1], f"{kinds[0]} for the results", "Name another one.")
+        above = path if path.is_dir() else next(p for p in path.absolute().parents if p.exists())
+        with TemporaryDirectory(prefix=".p2p", dir=above):
+            pass  # what may be written there is seen by writing alone: /proc, for one, says that all may
+        if path.is_file():
+            path.open("ab").close()
+    except OSError as error:
+        got, expected = f"what cannot be written ({error.strerror})", f"{kinds[0]} that can be written"
+        raise BadInput(what, got, expected, "Name another one.") from None
 
 
 def _doubt_outdated(folder: Path | None) -> None:
@@ -145,7 +176,9 @@ def _in_words(error: Exception, arguments: argparse.Namespace) -> str | None:
             where = f" ({theirs[-1][0].co_filename}:{theirs[-1][1]})" if theirs else ""
             what = f"{type(error).__name__}: {in_a_line(error)}"
             return f"{option} {place}: {called} raised {what}{where}. --debug shows the traceback."
-    return str(error) if isinstance(error, OSError) else None  # a full disk, a folder that may not be written
+    if isinstance(error, OSError):  # a full disk, say
+        return ": ".join(str(part) for part in (error.filename, error.strerror) if part) or str(error)
+    return None
 
 
 def _others_parts(arguments: argparse.Namespace) -> Iterator[tuple[str, str]]:

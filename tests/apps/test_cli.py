@@ -741,7 +741,16 @@ BAD_WORDS = {
     "model not there": (["run", "{seq}", "--out", "{out}", "--models", "object=/no.obj"], ["/no.obj", "no such model"]),
     "model of nobody": (["run", "{seq}", "--out", "{out}", "--models", "mug={seq}"], ["'mug'", "object"]),
     "out is a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt"], ["cam_K.txt", "a folder for the results"]),
-    "out within a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt"]),
+    "out within a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x: got what cannot be written"]),
+    "out is no place to write": (
+        ["export", "{done}", "--format", "tum", "--out", "/proc/x"],
+        ["--out /proc/x: got what cannot be written", "expected a folder that can be written. Name another one."],
+    ),
+    "film into a folder": (["film", "{done}", "--out", "{seq}"], ["--out", "slide: got a folder, expected a file"]),
+    "a film that cannot be": (
+        ["run", "{seq}", "--out", "{out}", "--overlay", "/proc/x.mp4"],
+        ["--overlay /proc/x.mp4"],
+    ),
     "export of too little": (
         ["export", "{done}", "--format", "tum", "--out", "{out}", "--min-confidence", "-0.1"],
         ["min_confidence", "-0.1"],
