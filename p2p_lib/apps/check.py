@@ -243,8 +243,11 @@ def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Cam
     text = size_doubt(known_m, measured_m := mask_length_m(frame, mask, camera))
     if text:
         return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")
-    text = f"{100 * measured_m:.1f} cm long in frame {frame.index}, {measured_m / known_m:.2f} times its known length"
-    return Finding(f"{name}: size", Level.OK, f"{text}: no more than masks are off")
+    if not np.isfinite(measured_m):
+        text = f"{100 * known_m:g} cm given; its mask in frame {frame.index} has too little depth to be measured"
+        return Finding(f"{name}: size", Level.OPTIONAL, text)
+    text = f"{100 * measured_m:.1f} cm by its mask in frame {frame.index}, {100 * known_m:g} cm given: fits"
+    return Finding(f"{name}: size", Level.OK, text)
 
 
 def _times(sequence: Sequence) -> Finding:

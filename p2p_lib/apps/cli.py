@@ -8,9 +8,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -26,16 +26,18 @@ from p2p_lib.apps.command_line import (
     SEQUENCE,
     again,
     arg,
+    as_it_began,
     command,
     main,
     open_page,
     output,
     run_options,
+    typed_options,
     warn,
 )
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import check_new
-from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
+from p2p_lib.core.options import RunOptions, differing, lengths_m, names, pairs
 from p2p_lib.core.progress import waiting_for
 from p2p_lib.offline import NOT_CAUSAL, PRODUCTS
 
@@ -83,7 +85,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
         metavar="N",
         help="with --resume: go on from frame N, say with new prompts",
     ),
-    run_options(),
+    typed_options,
     _OVERLAY,
     QUIET,
 )
@@ -97,14 +99,16 @@ def _run(a: argparse.Namespace) -> int:
         a.parser.error("--jobs and --scheduler go with --batch FOLDER: one recording is one job")
     if a.redo_from is not None and (a.batch is not None or a.if_exists != "resume"):
         a.parser.error("--from goes with --resume, and with SEQ")
-    options = _asked(a)
+    options = _asked(a, a.out if a.batch is None and a.if_exists == "resume" else None)
     with waiting_for("Loading libraries", not a.quiet):
+        from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
         from p2p_lib.datasets.runs import read_info
         from p2p_lib.run import run
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
 
+        _check_as_before(a.batch, a.out, options)
         table = run_batch(a.batch, a.out, options, a.jobs, a.scheduler, not a.quiet, warn)
         print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
         if failed := int(table["object"].isna().sum()):
@@ -113,20 +117,21 @@ def _run(a: argparse.Namespace) -> int:
             )
         return P2PError.exit_code if failed else 0
     film = _film_wanted(a.overlay)
-    options = replace(options, save_masks=a.save_masks or film is not None)
+    options = replace(options, save_masks=options.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
-    print("\n".join([*result.summary, *_without_map(a.out)]))
+    print("\n".join([*result.summary, *_that_fit(a.out, options.sizes), *_without_map(a.out)]))
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
         print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
+    first = a.out / FIRST_MASKS
+    results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:
         print(result.evaluation.as_table())
-        print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
+        print(f"{results}. Next: p2p eval {a.out} --json")
     elif a.out.is_dir():
         print(
-            f"Results in {a.out}; not scored, {_reason(result.not_scored, a.out)}."
-            + f" Next: p2p view {a.out}" * result.tracked
+            f"{results}; not scored, {_reason(result.not_scored, a.out)}." + f" Next: p2p view {a.out}" * result.tracked
         )
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
@@ -136,6 +141,41 @@ def _run(a: argparse.Namespace) -> int:
     if result.advice:
         warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
+
+
+def _check_as_before(folder: Path, out: Path, options: RunOptions) -> None:
+    """Refuse a batch that asks otherwise than its runs began: none would go on, and the table would lose their rows."""
+    from p2p_lib.benchmark.batch import recordings
+    from p2p_lib.datasets.runs import read_info
+
+    for one in recordings(folder, options):
+        try:
+            info = read_info(out / one.key) or {"frames": 0}
+        except P2PError:  # its row will say why
+            continue
+        asked = info.get("options") or {}, one.options.as_dict()
+        was, now = differing(*({**of, "skip_bad": None} for of in asked))
+        if info["frames"] and now:
+            fix = "Ask for the same, or name another --out. Nothing was run, and the table is as it was."
+            raise BadInput(f"{out / one.key}: the run to go on with", now, f"{was}, as it began", fix)
+
+
+def _that_fit(run: Path, sizes: Mapping[str, Any] | None) -> list[str]:
+    """A line for each object that was measured as long as it is known to be."""
+    if not sizes:
+        return []
+    from p2p_lib.datasets.mask_log import load_masks
+    from p2p_lib.evaluation.known_size import mesh_length_m, size_doubts
+    from p2p_lib.evaluation.suspicions import median_of_known
+
+    known_m, masks, lines = lengths_m(sizes, sizes), load_masks(run), []
+    doubts = size_doubts(run, known_m)
+    for name in (name for name in known_m if name not in doubts):
+        by_m = {"masks": median_of_known(masks[name].size_m)} if name in masks else {}
+        by_m["surface"] = mesh_length_m(run / "meshes" / f"{name}.ply")
+        if measured := [f"{100 * m:.1f} cm by its {what}" for what, m in by_m.items() if m == m]:
+            lines.append(f"{name}: {' and '.join(measured)}, {100 * known_m[name]:g} cm given: fits")
+    return lines
 
 
 def _without_map(run: Path) -> list[str]:
@@ -268,7 +308,8 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
 
     run = load_run(a.run)
     score, not_scored = None, ""
-    known_m = lengths_m(options.sizes or (run.info.get("options") or {}).get("sizes"), run.objects)
+    sizes = options.sizes or (run.info.get("options") or {}).get("sizes")
+    known_m = lengths_m(sizes, run.objects)
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
@@ -284,6 +325,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     judged = replace(consistency(replace(run, objects=rest), known_m=known_m), not_scored=not_scored) if rest else None
     said = [of for of in (score, judged) if of is not None]
     _show(said[0], a.json, bool(run.info.get("offline")), *said[1:])
+    print("".join(f"{line}\n" for line in _that_fit(a.run, sizes) if not a.json), end="")
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
@@ -524,9 +566,22 @@ def _notebooks(a: argparse.Namespace) -> None:
     study("runner").run_notebooks(a.profile, **how)
 
 
-def _asked(a: argparse.Namespace) -> RunOptions:
-    """The options of something that is tracked; one without what it is about is refused."""
+def _asked(a: argparse.Namespace, goes_on: Path | None = None) -> RunOptions:
+    """The options of something that is tracked; one without what it is about is refused.
+
+    goes_on  the folder of a run that is resumed, if there is one: what was left out is as it began
+    """
     options = RunOptions.of_arguments(a)
+    info = None
+    if goes_on is not None:
+        from p2p_lib.datasets.runs import read_info
+
+        info = read_info(goes_on)
+    if info is not None:
+        typed = [option.name for option in fields(RunOptions) if hasattr(a, option.name)]
+        options = as_it_began(info, **{name: getattr(options, name) for name in typed})
+        if taken := replace(options, **{name: getattr(RunOptions(), name) for name in typed}).words():
+            warn(f"p2p run: left out, and taken from the run in {goes_on}: {' '.join(taken)}")
     if options.frozen and not options.memory:
         a.parser.error("--frozen keeps the maps of --memory as they are: give --memory PATH, or leave it out")
     return options

@@ -13,7 +13,7 @@ import traceback
 import warnings
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -60,6 +60,15 @@ def output(metavar: str, help: str, flag: str = "--out", **how: Any) -> Argument
 def run_options(*wanted: str, **helps: str) -> Argument:
     """Options of a run (:class:`RunOptions`) that a command has as well; ``helps`` says what some mean to it."""
     return lambda parser: add_options(parser, *wanted, **helps)
+
+
+def typed_options(parser: argparse.ArgumentParser) -> None:
+    """All options of a run; what is not typed is no argument: a run that goes on takes it from the earlier one."""
+    add_options(parser)
+    options = {option.name for option in fields(RunOptions)}
+    for action in parser._actions:
+        if action.dest in options:
+            action.default = argparse.SUPPRESS
 
 
 #: What several commands take.
@@ -241,9 +250,14 @@ def _meant(word: str, known: list[str]) -> str:
     return f". {meant}" if meant else ""
 
 
+def as_it_began(info: Mapping[str, Any], **changes: Any) -> RunOptions:
+    """What a run was asked for, with ``changes``."""
+    return replace(RunOptions(**(info.get("options") or {})), **changes)
+
+
 def again(info: Mapping[str, Any], out: Path, **changes: Any) -> str:
     """The command that makes a run in its folder ``out`` once more, with ``changes`` of its options."""
-    asked = replace(RunOptions(**(info.get("options") or {})), **changes)
+    asked = as_it_began(info, **changes)
     place = info["path"] or info["sequence"]
     return " ".join(["p2p run", quote(place), "--out", quote(str(out)), *asked.words()])
 

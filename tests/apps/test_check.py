@@ -387,7 +387,10 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     known = {"sizes": {"box": 100 * length_m}}
     assert found(good, "box: size", **known).level is Level.OK
     shorter = found(good, "box: size", sizes={"box": 90 * length_m})
-    assert shorter.level is Level.OK and "1.11 times its known length" in shorter.text
+    said = f"{100 * length_m:.1f} cm by its mask in frame 0, {90 * length_m:g} cm given: fits"
+    assert (shorter.level, shorter.text) == (Level.OK, said)
+    bare = replace(frame, depth_m=np.zeros_like(frame.depth_m))
+    assert check._size("box", length_m, bare, bare.depth_m == 0, CAMERA).level is Level.OPTIONAL, "not measured"
     wide = another_K(open_sequence(good), CAMERA.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]])
     finding = found(wide, "box: size", **known)
     assert finding.level is Level.LOOK and re.search(r"(1\.[5-9]|2\.0)\d? times: focal length", finding.text)
