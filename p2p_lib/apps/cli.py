@@ -77,7 +77,13 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     arg("--scheduler", metavar="tcp://HOST:PORT", help="for --batch: a Dask cluster that sees DIR"),
     output("DIR", "folder for the results", required=True),
     _FORCE,
-    arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
+    arg(
+        "--resume",
+        dest="if_exists",
+        action="store_const",
+        const="resume",
+        help="go on with one that was cut short, as it began",
+    ),
     arg(
         "--from",
         dest="redo_from",
@@ -538,12 +544,14 @@ def _view(a: argparse.Namespace) -> None:
     _RUN,
     output("FILE", ".mp4, .gif or .webp (default DIR/film.mp4)"),
     arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF or WebP)"),
+    arg("--surfaces", action="store_true", help="outline each reconstructed surface at its pose, in white"),
 )
 def _film(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import read_info
     from p2p_lib.figures.film import write_film
 
-    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width, progress=True)}")
+    how = {"width_px": a.width, "progress": True, "surfaces": a.surfaces}
+    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', **how)}")
     info = read_info(a.run) or {}
     if info.get("masks") != "dataset" and not (a.run / info.get("masks_in", "") / "masks").is_dir():
         warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
