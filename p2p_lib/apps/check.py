@@ -6,8 +6,10 @@ milliseconds, masks that hold the table too, objects without anything to track.
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Sequence as SequenceOf
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -92,17 +94,19 @@ def check_folder(
         return (_files(Path(str(sequence)).expanduser()) if own else []) or [_unreadable("files", error)]
     sequence, frames, masks = opened, list[Frame](), list[Mapping[str, np.ndarray]]()
     whole, wrong = _whole(sequence)
-    for i in evenly(whole, FRAMES).tolist():
+    looked_at, faults = evenly(whole, FRAMES).tolist(), list[tuple[P2PError, str]]()
+    for i in looked_at:
         try:
             frames.append(sequence.frame(i))
         except P2PError as error:
-            wrong.append(_unreadable("files", error, otherwise=f"{_REPLACE} {images.SKIP_BAD}"))
+            faults.append((error, f"{_REPLACE} {images.SKIP_BAD}"))
             continue
         masks.append({})
         try:
             masks[-1] = sequence.masks(i) or {}
         except P2PError as error:
-            wrong.append(_unreadable("files", error))
+            faults.append((error, ""))
+    wrong += _once(faults, len(looked_at))
     if not frames:
         return wrong
     with warnings.catch_warnings(record=True) as doubts:
@@ -145,7 +149,7 @@ def check_folder(
     return findings
 
 
-def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "") -> Finding:
+def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "", more: str = "") -> Finding:
     """An error as a finding; ``fix`` in place of its own advice, ``otherwise`` where it has none."""
     if isinstance(error, BadInput):
         text, advice = f"{error.name}: got {error.got}, expected {error.expected}", error.fix
@@ -153,7 +157,19 @@ def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "") 
         text, advice = f"{error.name}: {error.expected}", error.fix
     else:
         text, advice = str(error), ""
-    return Finding(name, Level.WRONG, text, fix or advice or otherwise)
+    return Finding(name, Level.WRONG, f"{text}{more}", fix or advice or otherwise)
+
+
+def _once(faults: Iterable[tuple[P2PError, str]], looked_at: int) -> Iterator[Finding]:
+    """Errors of files, each with what to do otherwise; those that differ in names and numbers alone are one finding."""
+    alike: dict[str, list[tuple[P2PError, str]]] = {}
+    for error, otherwise in faults:
+        said = str(error).replace(getattr(error, "name", ""), "")
+        alike.setdefault(re.sub(r"\d+", "N", said), []).append((error, otherwise))
+    for (first, otherwise), *others in alike.values():
+        names = [Path(getattr(error, "name", "")).name for error, _ in others]
+        more = f"; {len(names)} more like it of the {looked_at} frames looked at: {_listed(names)}" if names else ""
+        yield _unreadable("files", first, otherwise=otherwise, more=more)
 
 
 def _whole(sequence: Sequence) -> tuple[np.ndarray, list[Finding]]:
@@ -171,9 +187,9 @@ def _whole(sequence: Sequence) -> tuple[np.ndarray, list[Finding]]:
     ]
 
 
-def _listed(paths: list[Path]) -> str:
-    more = len(paths) - _LISTED
-    return ", ".join(map(str, paths[:_LISTED])) + (f" and {more} more" if more > 0 else "")
+def _listed(names: SequenceOf[Path | str]) -> str:
+    more = len(names) - _LISTED
+    return ", ".join(map(str, names[:_LISTED])) + (f" and {more} more" if more > 0 else "")
 
 
 def _readable(sequence: Sequence, i: int) -> Frame | None:
@@ -227,8 +243,11 @@ def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Cam
     text = size_doubt(known_m, measured_m := mask_length_m(frame, mask, camera))
     if text:
         return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")
-    text = f"{100 * measured_m:.1f} cm long in frame {frame.index}, {measured_m / known_m:.2f} times its known length"
-    return Finding(f"{name}: size", Level.OK, f"{text}: no more than masks are off")
+    if not np.isfinite(measured_m):
+        text = f"{100 * known_m:g} cm given; its mask in frame {frame.index} has too little depth to be measured"
+        return Finding(f"{name}: size", Level.OPTIONAL, text)
+    text = f"{100 * measured_m:.1f} cm by its mask in frame {frame.index}, {100 * known_m:g} cm given: fits"
+    return Finding(f"{name}: size", Level.OK, text)
 
 
 def _times(sequence: Sequence) -> Finding:

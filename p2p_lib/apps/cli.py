@@ -8,9 +8,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -26,15 +26,18 @@ from p2p_lib.apps.command_line import (
     SEQUENCE,
     again,
     arg,
+    as_it_began,
     command,
     main,
     open_page,
+    output,
     run_options,
+    typed_options,
     warn,
 )
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.files import check_new
-from p2p_lib.core.options import RunOptions, lengths_m, names, pairs
+from p2p_lib.core.options import RunOptions, differing, lengths_m, names, pairs
 from p2p_lib.core.progress import waiting_for
 from p2p_lib.offline import NOT_CAUSAL, PRODUCTS
 
@@ -45,11 +48,8 @@ _FILES = (
     "poses as bop: p2p_SEQ-test.csv; tum: OBJECT.txt; poses: annotated_poses/OBJECT/FRAME.txt, 4x4 (all in DIR);"
     " bop-dataset: labelled images, masks and models; foundationpose: images, first mask, mesh; model: textured meshes"
 )
-_OVERLAY = arg(
-    "--overlay",
-    type=Path,
-    metavar="FILE",
-    help="besides a film of it: .mp4, or a .gif or .webp at most 480 px wide (see p2p film)",
+_OVERLAY = output(
+    "FILE", "besides a film of it: .mp4, or a .gif or .webp at most 480 px wide (see p2p film)", "--overlay"
 )
 _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace", help="replace an earlier run in DIR")
 _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
@@ -75,9 +75,15 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     ),
     arg("--jobs", type=int, metavar="N", help="recordings of --batch at a time (default: one a core)"),
     arg("--scheduler", metavar="tcp://HOST:PORT", help="for --batch: a Dask cluster that sees DIR"),
-    arg("--out", type=Path, required=True, metavar="DIR", help="folder for the results"),
+    output("DIR", "folder for the results", required=True),
     _FORCE,
-    arg("--resume", dest="if_exists", action="store_const", const="resume", help="go on with one that was cut short"),
+    arg(
+        "--resume",
+        dest="if_exists",
+        action="store_const",
+        const="resume",
+        help="go on with one that was cut short, as it began",
+    ),
     arg(
         "--from",
         dest="redo_from",
@@ -85,7 +91,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
         metavar="N",
         help="with --resume: go on from frame N, say with new prompts",
     ),
-    run_options(),
+    typed_options,
     _OVERLAY,
     QUIET,
 )
@@ -99,14 +105,16 @@ def _run(a: argparse.Namespace) -> int:
         a.parser.error("--jobs and --scheduler go with --batch FOLDER: one recording is one job")
     if a.redo_from is not None and (a.batch is not None or a.if_exists != "resume"):
         a.parser.error("--from goes with --resume, and with SEQ")
-    options = _asked(a)
+    options = _asked(a, a.out if a.batch is None and a.if_exists == "resume" else None)
     with waiting_for("Loading libraries", not a.quiet):
+        from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
         from p2p_lib.datasets.runs import read_info
         from p2p_lib.run import run
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
         from p2p_lib.core.tables import as_text
 
+        _check_as_before(a.batch, a.out, options)
         table = run_batch(a.batch, a.out, options, a.jobs, a.scheduler, not a.quiet, warn)
         print(f"{as_text(table)}\nResults in {a.out}, the table in {a.out / TABLE}")
         if failed := int(table["object"].isna().sum()):
@@ -115,20 +123,21 @@ def _run(a: argparse.Namespace) -> int:
             )
         return P2PError.exit_code if failed else 0
     film = _film_wanted(a.overlay)
-    options = replace(options, save_masks=a.save_masks or film is not None)
+    options = replace(options, save_masks=options.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
-    print("\n".join([*result.summary, *_without_map(a.out)]))
+    print("\n".join([*result.summary, *_that_fit(a.out, options.sizes), *_without_map(a.out)]))
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
         print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
+    first = a.out / FIRST_MASKS
+    results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:
         print(result.evaluation.as_table())
-        print(f"Results in {a.out}. Next: p2p eval {a.out} --json")
+        print(f"{results}. Next: p2p eval {a.out} --json")
     elif a.out.is_dir():
         print(
-            f"Results in {a.out}; not scored, {_reason(result.not_scored, a.out)}."
-            + f" Next: p2p view {a.out}" * result.tracked
+            f"{results}; not scored, {_reason(result.not_scored, a.out)}." + f" Next: p2p view {a.out}" * result.tracked
         )
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
@@ -138,6 +147,41 @@ def _run(a: argparse.Namespace) -> int:
     if result.advice:
         warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
+
+
+def _check_as_before(folder: Path, out: Path, options: RunOptions) -> None:
+    """Refuse a batch that asks otherwise than its runs began: none would go on, and the table would lose their rows."""
+    from p2p_lib.benchmark.batch import recordings
+    from p2p_lib.datasets.runs import read_info
+
+    for one in recordings(folder, options):
+        try:
+            info = read_info(out / one.key) or {"frames": 0}
+        except P2PError:  # its row will say why
+            continue
+        asked = info.get("options") or {}, one.options.as_dict()
+        was, now = differing(*({**of, "skip_bad": None} for of in asked))
+        if info["frames"] and now:
+            fix = "Ask for the same, or name another --out. Nothing was run, and the table is as it was."
+            raise BadInput(f"{out / one.key}: the run to go on with", now, f"{was}, as it began", fix)
+
+
+def _that_fit(run: Path, sizes: Mapping[str, Any] | None) -> list[str]:
+    """A line for each object that was measured as long as it is known to be."""
+    if not sizes:
+        return []
+    from p2p_lib.datasets.mask_log import load_masks
+    from p2p_lib.evaluation.known_size import mesh_length_m, size_doubts
+    from p2p_lib.evaluation.suspicions import median_of_known
+
+    known_m, masks, lines = lengths_m(sizes, sizes), load_masks(run), []
+    doubts = size_doubts(run, known_m)
+    for name in (name for name in known_m if name not in doubts):
+        by_m = {"masks": median_of_known(masks[name].size_m)} if name in masks else {}
+        by_m["surface"] = mesh_length_m(run / "meshes" / f"{name}.ply")
+        if measured := [f"{100 * m:.1f} cm by its {what}" for what, m in by_m.items() if m == m]:
+            lines.append(f"{name}: {' and '.join(measured)}, {100 * known_m[name]:g} cm given: fits")
+    return lines
 
 
 def _without_map(run: Path) -> list[str]:
@@ -169,7 +213,7 @@ def _without_map(run: Path) -> list[str]:
         help="lines of JSON on standard input add, correct and remove objects; their frame is the next one",
     ),
     arg("--click", action="store_true", help="a page on the newest image adds, corrects and removes objects"),
-    arg("--out", type=Path, metavar="DIR", help="folder that keeps the run, as p2p run does"),
+    output("DIR", "folder that keeps the run, as p2p run does"),
     _FORCE,
     _OVERLAY,
     NO_BROWSER,
@@ -270,7 +314,8 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
 
     run = load_run(a.run)
     score, not_scored = None, ""
-    known_m = lengths_m(options.sizes or (run.info.get("options") or {}).get("sizes"), run.objects)
+    sizes = options.sizes or (run.info.get("options") or {}).get("sizes")
+    known_m = lengths_m(sizes, run.objects)
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
@@ -286,6 +331,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     judged = replace(consistency(replace(run, objects=rest), known_m=known_m), not_scored=not_scored) if rest else None
     said = [of for of in (score, judged) if of is not None]
     _show(said[0], a.json, bool(run.info.get("offline")), *said[1:])
+    print("".join(f"{line}\n" for line in _that_fit(a.run, sizes) if not a.json), end="")
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
@@ -320,13 +366,13 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     "run methods on sequences with seeds as a plan says; resumes",
     arg("plan", nargs="*", metavar="PLAN", help="TOML files, or names that --list shows"),
     arg("--list", action="store_true", help="what can run here and now; of PLAN: what it lacks"),
-    arg("--out", type=Path, metavar="DIR", help="runs, records and tables; several plans may share it"),
+    output("DIR", "runs, records and tables; several plans may share it"),
     arg("--quick", action="store_true", help="a few frames of bundled data instead of the plan in full"),
     arg("--jobs", type=int, metavar="N", help="runs at a time on this machine (default: one a core)"),
     arg("--scheduler", metavar="tcp://HOST:PORT", help="of a Dask cluster that sees DIR; trust who can reach it"),
     arg("--retry", action="store_true", help="try again what failed before"),
     arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
-    arg("--tables", type=Path, metavar="DIR", help="tables with notes of what they are of go here, too"),
+    output("DIR", "tables with notes of what they are of go here, too", "--tables"),
     arg("--stale", action="store_true", help="what of figures/ is of earlier code: marked so, with --out made anew"),
     QUIET,
 )
@@ -397,12 +443,11 @@ def _stale(a: argparse.Namespace) -> int:
 @command(
     "figures",
     "draw the paper's qualitative figures and write the index of all its figures and tables",
-    arg("--out", type=Path, metavar="DIR", help="runs, found again the next time (default out/benchmark)"),
-    arg(
+    output("DIR", "runs, found again the next time (default out/benchmark)"),
+    output(
+        "DIR",
+        "pictures and their index go here, over those there (default $P2P_FIGURES, else figures/ of the clone)",
         "--figures",
-        type=Path,
-        metavar="DIR",
-        help="pictures and their index go here, over those there (default $P2P_FIGURES, else figures/ of the clone)",
     ),
     arg("--only", metavar="fig1_three_objects,runtime", help="these pictures alone, by their names"),
     arg(
@@ -454,7 +499,7 @@ def _refine(a: argparse.Namespace) -> None:
     "write a run's poses as BOP, TUM or a dataset keeps them, a labelled dataset, or textured models",
     _RUN,
     arg("--format", required=True, choices=("bop", "tum", "poses", *PRODUCTS), help=_FILES),
-    arg("--out", type=Path, required=True, metavar="DIR", help="a new or empty folder for the files"),
+    output("DIR", "a new or empty folder for the files", required=True),
     arg("--frame", choices=("object", "model"), help="the tracker's (bop without truth needs it) or the model's"),
     arg("--min-confidence", type=float, metavar="C", help="leave less confident poses out (default 0, of labels 0.5)"),
     arg("--faces", type=int, default=5000, metavar="N", help="of a textured model, at most (default 5000)"),
@@ -482,7 +527,7 @@ def _export(a: argparse.Namespace) -> None:
     "view",
     "look at a run in 3D with a time slider, in the browser",
     _RUN,
-    arg("--out", type=Path, metavar="FILE", help="the page (default DIR/view.html); it needs nothing else"),
+    output("FILE", "the page (default DIR/view.html); it needs nothing else"),
     NO_BROWSER,
 )
 def _view(a: argparse.Namespace) -> None:
@@ -497,14 +542,16 @@ def _view(a: argparse.Namespace) -> None:
     "film",
     "write a run as a film: boxes, axes, statuses, keypoints, masks",
     _RUN,
-    arg("--out", type=Path, metavar="FILE", help=".mp4, .gif or .webp (default DIR/film.mp4)"),
+    output("FILE", ".mp4, .gif or .webp (default DIR/film.mp4)"),
     arg("--width", type=int, metavar="PX", help="of its images (default: the camera's, at most 480 of a GIF or WebP)"),
+    arg("--surfaces", action="store_true", help="outline each reconstructed surface at its pose, in white"),
 )
 def _film(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import read_info
     from p2p_lib.figures.film import write_film
 
-    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', width_px=a.width, progress=True)}")
+    how = {"width_px": a.width, "progress": True, "surfaces": a.surfaces}
+    print(f"Written to {write_film(a.run, a.out or a.run / 'film.mp4', **how)}")
     info = read_info(a.run) or {}
     if info.get("masks") != "dataset" and not (a.run / info.get("masks_in", "") / "masks").is_dir():
         warn("p2p film: no masks were kept, so none is outlined. p2p run --save-masks keeps them.")
@@ -517,7 +564,7 @@ def _film(a: argparse.Namespace) -> None:
     arg("--only", metavar="00,03", help="only these notebooks"),
     arg("--jobs", type=int, default=1, metavar="N", help="notebooks at a time"),
     arg("--parameter", action="append", metavar="NAME=VALUE", help="change a notebook parameter; repeatable"),
-    arg("--out", type=Path, metavar="DIR", help="folder of results (default out/PROFILE; with --parameter beside it)"),
+    output("DIR", "folder of results (default out/PROFILE; with --parameter beside it)"),
 )
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study
@@ -527,9 +574,22 @@ def _notebooks(a: argparse.Namespace) -> None:
     study("runner").run_notebooks(a.profile, **how)
 
 
-def _asked(a: argparse.Namespace) -> RunOptions:
-    """The options of something that is tracked; one without what it is about is refused."""
+def _asked(a: argparse.Namespace, goes_on: Path | None = None) -> RunOptions:
+    """The options of something that is tracked; one without what it is about is refused.
+
+    goes_on  the folder of a run that is resumed, if there is one: what was left out is as it began
+    """
     options = RunOptions.of_arguments(a)
+    info = None
+    if goes_on is not None:
+        from p2p_lib.datasets.runs import read_info
+
+        info = read_info(goes_on)
+    if info is not None:
+        typed = [option.name for option in fields(RunOptions) if hasattr(a, option.name)]
+        options = as_it_began(info, **{name: getattr(options, name) for name in typed})
+        if taken := replace(options, **{name: getattr(RunOptions(), name) for name in typed}).words():
+            warn(f"p2p run: left out, and taken from the run in {goes_on}: {' '.join(taken)}")
     if options.frozen and not options.memory:
         a.parser.error("--frozen keeps the maps of --memory as they are: give --memory PATH, or leave it out")
     return options

@@ -7,7 +7,6 @@ prompts (:mod:`p2p_lib.datasets.prompts`). In a notebook a :class:`Clicker` show
 from __future__ import annotations
 
 import json
-import os
 import re
 import secrets
 import warnings
@@ -207,14 +206,6 @@ def check_depths(sequence: Sequence, prompts: Iterable[Prompt]) -> None:
     """Refuse clicks and boxes without depth: a run would end there."""
     for prompt in prompts:
         check_depth(prompt, sequence.frame(prompt.frame))
-
-
-def check_writable(path: Path) -> None:
-    """Refuse a file that could not be written in the end, before anyone works for it."""
-    folder = next(p for p in path.absolute().parents if p.exists())
-    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        what = "a folder" if path.is_dir() else "what cannot be written"
-        raise BadInput(f"--out {path}", what, "a file in a folder that can be written")
 
 
 def invite(clicker: Clicker, say: Callable[[str], object], open_browser: bool, more: str = "") -> None:

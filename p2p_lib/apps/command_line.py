@@ -13,17 +13,18 @@ import traceback
 import warnings
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tqdm import tqdm
 
 from p2p_lib import __version__
 from p2p_lib.core.backends import DETECTORS, SEGMENTERS, TRACKERS
-from p2p_lib.core.errors import Doubt, Doubts, P2PError, did_you_mean, doubt, in_a_line
+from p2p_lib.core.errors import BadInput, Doubt, Doubts, P2PError, did_you_mean, doubt, in_a_line
 from p2p_lib.core.options import RunOptions, add_options
 from p2p_lib.core.plugins import is_place, offered
 
@@ -46,9 +47,28 @@ def arg(*flags: str, **how: Any) -> Argument:
     return lambda parser: parser.add_argument(*flags, **how)
 
 
+def output(metavar: str, help: str, flag: str = "--out", **how: Any) -> Argument:
+    """A folder (``metavar`` DIR) or a file that a command writes: one that cannot be is refused before it begins."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        written = parser.add_argument(flag, type=Path, metavar=metavar, help=help, **how)
+        parser.set_defaults(outputs=[*(parser.get_default("outputs") or ()), written])
+
+    return add
+
+
 def run_options(*wanted: str, **helps: str) -> Argument:
     """Options of a run (:class:`RunOptions`) that a command has as well; ``helps`` says what some mean to it."""
     return lambda parser: add_options(parser, *wanted, **helps)
+
+
+def typed_options(parser: argparse.ArgumentParser) -> None:
+    """All options of a run; what is not typed is no argument: a run that goes on takes it from the earlier one."""
+    add_options(parser)
+    options = {option.name for option in fields(RunOptions)}
+    for action in parser._actions:
+        if action.dest in options:
+            action.default = argparse.SUPPRESS
 
 
 #: What several commands take.
@@ -92,6 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = partial(_show_doubt, warnings.showwarning, arguments.name, doubts)
+            for of in getattr(arguments, "outputs", ()):
+                check_writable(of.option_strings[0], getattr(arguments, of.dest), of.metavar == "DIR")
             _doubt_outdated(getattr(arguments, "run", None))
             return arguments.command(arguments) or 0
     except BrokenPipeError:  # the reader of our output (head, less) has gone
@@ -114,6 +136,24 @@ def main(argv: Sequence[str] | None = None) -> int:
             warn(f"p2p {arguments.name}: {line}")
         if in_main:
             signal.signal(signal.SIGTERM, before)
+
+
+def check_writable(option: str, path: Path | None, folder: bool) -> None:
+    """Refuse a folder, or else a file, that could not be written in the end, before anyone works or waits for it."""
+    if path is None:
+        return
+    what, kinds = f"{option} {path}", ("a folder", "a file")[:: 1 if folder else -1]
+    try:
+        if path.exists() and path.is_dir() != folder:
+            raise BadInput(what, kinds[1], f"{kinds[0]} for the results", "Name another one.")
+        above = path if path.is_dir() else next(p for p in path.absolute().parents if p.exists())
+        with TemporaryDirectory(prefix=".p2p", dir=above):
+            pass  # what may be written there is seen by writing alone: /proc, for one, says that all may
+        if path.is_file():
+            path.open("ab").close()
+    except OSError as error:
+        got, expected = f"what cannot be written ({error.strerror})", f"{kinds[0]} that can be written"
+        raise BadInput(what, got, expected, "Name another one.") from None
 
 
 def _doubt_outdated(folder: Path | None) -> None:
@@ -145,7 +185,9 @@ def _in_words(error: Exception, arguments: argparse.Namespace) -> str | None:
             where = f" ({theirs[-1][0].co_filename}:{theirs[-1][1]})" if theirs else ""
             what = f"{type(error).__name__}: {in_a_line(error)}"
             return f"{option} {place}: {called} raised {what}{where}. --debug shows the traceback."
-    return str(error) if isinstance(error, OSError) else None  # a full disk, a folder that may not be written
+    if isinstance(error, OSError):  # a full disk, say
+        return ": ".join(str(part) for part in (error.filename, error.strerror) if part) or str(error)
+    return None
 
 
 def _others_parts(arguments: argparse.Namespace) -> Iterator[tuple[str, str]]:
@@ -208,9 +250,14 @@ def _meant(word: str, known: list[str]) -> str:
     return f". {meant}" if meant else ""
 
 
+def as_it_began(info: Mapping[str, Any], **changes: Any) -> RunOptions:
+    """What a run was asked for, with ``changes``."""
+    return replace(RunOptions(**(info.get("options") or {})), **changes)
+
+
 def again(info: Mapping[str, Any], out: Path, **changes: Any) -> str:
     """The command that makes a run in its folder ``out`` once more, with ``changes`` of its options."""
-    asked = replace(RunOptions(**(info.get("options") or {})), **changes)
+    asked = as_it_began(info, **changes)
     place = info["path"] or info["sequence"]
     return " ".join(["p2p run", quote(place), "--out", quote(str(out)), *asked.words()])
 

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from p2p_lib.apps.command_line import JSON, NO_BROWSER, QUIET, SEQUENCE, again, arg, command, run_options, warn
+from p2p_lib.apps.command_line import JSON, NO_BROWSER, QUIET, SEQUENCE, again, arg, command, output, run_options, warn
 from p2p_lib.core.errors import BadInput, P2PError
 from p2p_lib.core.options import RunOptions, names
 
@@ -21,7 +21,7 @@ _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
     "click",
     "collect clicks on objects, and masks painted with a brush, in the browser, for p2p run --prompts",
     SEQUENCE,
-    arg("--out", type=Path, required=True, metavar="FILE", help="the prompts; what it holds is shown first"),
+    output("FILE", "the prompts; what it holds is shown first", required=True),
     arg("--frame", type=int, default=0, metavar="I", help="frame to begin with (default 0)"),
     arg("--run", type=Path, metavar="DIR", help="show the masks that a run kept (--save-masks), to be mended"),
     arg("--port", type=int, default=0, metavar="N", help="of the page (default: a free one)"),
@@ -29,11 +29,10 @@ _POSE_LOG = "time_s tx ty tz qx qy qz qw a line (TUM or CSV)"
     run_options("format", "depth_scale"),
 )
 def _click(a: argparse.Namespace) -> None:
-    from p2p_lib.apps.click import Clicker, check_writable, first_change, wait_for_clicks
+    from p2p_lib.apps.click import Clicker, first_change, wait_for_clicks
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.datasets.sequence import open_sequence
 
-    check_writable(a.out)
     sequence = open_sequence(a.sequence, a.format, a.depth_scale)
     shown = load_run(a.run) if a.run is not None else None
     if shown is not None and (of := shown.info["sequence"]) != sequence.name:
@@ -76,7 +75,7 @@ def _check(a: argparse.Namespace) -> int:
     "convert",
     "make a folder for p2p run of a recording (ROS, RealSense, Azure Kinect) or of another layout",
     arg("source", type=Path, metavar="SOURCE", help=".bag, .db3, .mcap, .mkv, a ROS 2 folder, or any sequence"),
-    arg("--out", type=Path, required=True, metavar="DIR", help="a new folder"),
+    output("DIR", "a new folder", required=True),
     arg("--colour", metavar="TOPIC", help="of a ROS recording (default: the likeliest)"),
     arg("--depth", metavar="TOPIC", help="of a ROS recording, registered to colour (default: the likeliest)"),
     run_options("format", "depth_scale"),
@@ -94,7 +93,7 @@ def _convert(a: argparse.Namespace) -> None:
     "render a synthetic sequence in the YCBMultiTrack layout, with exact truth",
     arg("scenario", nargs="?", metavar="SCENARIO", help="what happens; --list shows all"),
     arg("--list", action="store_true", help="list the scenarios"),
-    arg("--out", type=Path, metavar="DIR", help="a new folder for the sequence"),
+    output("DIR", "a new folder for the sequence"),
     arg("--seed", type=int, default=0, metavar="N", help="of labels, paths and noise (default 0)"),
     arg("--noise", default="realsense", metavar="NAME", help="exact, realsense (default) or hard"),
     arg(

@@ -34,16 +34,18 @@ def write_film(
     sequence: Sequence | None = None,
     width_px: int | None = None,
     progress: bool = False,
+    surfaces: bool = False,
 ) -> Path:
     """A run's folder as a film: boxes, axes, statuses, keypoints, and masks where the run has them; the path written.
 
     It plays as fast as it was recorded. width_px: of its images (default: the camera's; at most 480 but for MP4).
+    surfaces: whether each reconstructed surface is outlined in white at its pose, so that both can be judged.
 
     Raises :class:`BadInput` for another kind of file, :class:`MissingData` where the images are gone.
     """
     check_suffix(out)
     playback = Playback.of(run, sequence)
-    scene, for_a_page = Scene.of(playback), Path(out).suffix != ".mp4"
+    scene, for_a_page = Scene.of(playback, surfaces), Path(out).suffix != ".mp4"
     width_px = width_px or min(playback.images.camera.width, _PAGE_PX if for_a_page else 1 << 16)
     every = max(1, round(playback.rate_hz / _PAGE_HZ)) if for_a_page else 1
     rows = range(0, len(playback), every)

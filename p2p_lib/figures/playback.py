@@ -6,18 +6,20 @@ import contextlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData, P2PError
+from p2p_lib.core.raycasting import ray_scene
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import LIVE, Sequence, reopen
+from p2p_lib.evaluation.evidence import drawn_m
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.figures import style
 
@@ -150,6 +152,16 @@ class Playback:
         from trimesh.sample import sample_surface
 
         return {name: cKDTree(sample_surface(mesh, _SAMPLES, seed=0)[0]) for name, mesh in self.meshes.items()}
+
+    def silhouettes(self, i: int) -> dict[str, np.ndarray]:
+        """Where (H, W) bool each reconstructed surface is in the image at its pose of row i, whatever hides it."""
+        posed = [name for name in self.meshes if self.objects[name].has_pose[i] and self.of_kept_map(name)[i]]
+        poses = {name: self.objects[name].T_cam_obj[i] for name in posed}
+        return {name: drawn_m(self._ray_scenes[name], self.images.camera, T) > 0 for name, T in poses.items()}
+
+    @cached_property
+    def _ray_scenes(self) -> dict[str, Any]:
+        return {name: ray_scene(mesh.vertices, mesh.faces) for name, mesh in self.meshes.items()}
 
     def masks(self, i: int) -> dict[str, np.ndarray]:
         """The masks (H, W) bool of row i, as the run gives them; none without a sequence."""

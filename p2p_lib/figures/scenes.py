@@ -21,6 +21,8 @@ from p2p_lib.figures.plots import gaps
 
 #: How strongly a mask tints its inside, and the radius of a keypoint.
 _FILL, _POINT_PX = 0.15, 2.5
+#: Of the outline of a surface, beside that of its object's mask in the object's colour.
+_SURFACE = "#ffffff"
 
 
 class Scene:
@@ -66,13 +68,17 @@ class Scene:
             self._boxes[name, kept[name]] = Box.around(points, score.T_obj_model)
         self._boxes |= {(name, kept[name]): box for name, box in (boxes or {}).items()}
         self._playback: Playback | None = None
+        self._surfaces = False
 
     @classmethod
-    def of(cls, playback: Playback) -> Scene:
-        """With all that the run's folder holds: keypoints, masks, and a box around each reconstructed surface."""
+    def of(cls, playback: Playback, surfaces: bool = False) -> Scene:
+        """With all that the run's folder holds: keypoints, masks, and a box around each reconstructed surface.
+
+        surfaces  whether the outline of each surface at its pose is drawn, too
+        """
         boxes = {name: overlay.tight_box(mesh) for name, mesh in playback.meshes.items()}
         scene = cls(playback.images, playback.run, boxes=boxes, truth=False, objects=playback.objects)
-        scene._playback = playback
+        scene._playback, scene._surfaces = playback, surfaces
         return scene
 
     @classmethod
@@ -171,6 +177,8 @@ class Scene:
         image = overlay.draw_masks(frame.rgb, self._playback.masks(row), self.colours, fill=_FILL)
         for name, points in self._playback.keypoints.items():
             image = overlay.draw_points(image, points.uv_px[points.at(frame.index)], self.colours[name], _POINT_PX)
+        for shown in self._playback.silhouettes(row).values() if self._surfaces else ():
+            image = overlay.draw_mask(image, shown, _SURFACE, width_px=1)
         return image
 
     def _draw_object(

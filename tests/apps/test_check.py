@@ -387,7 +387,10 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     known = {"sizes": {"box": 100 * length_m}}
     assert found(good, "box: size", **known).level is Level.OK
     shorter = found(good, "box: size", sizes={"box": 90 * length_m})
-    assert shorter.level is Level.OK and "1.11 times its known length" in shorter.text
+    said = f"{100 * length_m:.1f} cm by its mask in frame 0, {90 * length_m:g} cm given: fits"
+    assert (shorter.level, shorter.text) == (Level.OK, said)
+    bare = replace(frame, depth_m=np.zeros_like(frame.depth_m))
+    assert check._size("box", length_m, bare, bare.depth_m == 0, CAMERA).level is Level.OPTIONAL, "not measured"
     wide = another_K(open_sequence(good), CAMERA.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]])
     finding = found(wide, "box: size", **known)
     assert finding.level is Level.LOOK and re.search(r"(1\.[5-9]|2\.0)\d? times: focal length", finding.text)
@@ -425,6 +428,20 @@ def test_an_image_that_ends_too_early_is_found_wherever_it_is(good, tmp_path, mo
     assert "--skip-bad" in wrong.fix
 
 
+def test_a_fault_of_every_image_is_said_once(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "eight")
+    for k, path in enumerate(open_sequence(folder).depth):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), (depth // 32).astype(np.uint8) if k % 2 else depth[: 100 + k])
+    eight, size = (
+        f.text.partition(": ")[2] for f in sorted(check_folder(folder), key=lambda f: "one channel" not in f.text)
+    )
+    assert eight.startswith("got (480, 640) uint8") and eight.endswith(
+        "; 2 more like it of the 6 frames looked at: 000003.png, 000005.png"
+    )
+    assert size.startswith("got 640x100, expected 640x480") and size.endswith("looked at: 000002.png, 000004.png")
+
+
 def test_what_is_missing_is_named(good, tmp_path):
     folder = shutil.copytree(good, tmp_path / "less")
     (folder / "masks/box/000000.png").unlink()
@@ -447,7 +464,10 @@ def test_what_is_missing_is_named(good, tmp_path):
     for k in (1, 3):  # ends as it should, and is none
         (folder / f"rgb/00000{k}.png").write_bytes(b"\x89PNG IEND")
     findings = check_folder(folder)
-    assert [finding.text.partition(":")[0][-10:] for finding in alarms(findings)] == ["000001.png", "000003.png"]
+    (wrong,) = alarms(findings)
+    assert "000001.png: got" in wrong.text and wrong.text.endswith(
+        "1 more like it of the 6 frames looked at: 000003.png"
+    )
     replace_it = "Replace it, or leave out both of its images."
     assert {finding.fix for finding in alarms(findings)} == {f"{replace_it} {SKIP_BAD}"}
     (folder / "rgb/000000.png").write_bytes(b"\x89PNG IEND")

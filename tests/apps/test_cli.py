@@ -77,7 +77,8 @@ def test_a_run_says_its_score_and_what_to_do_next(sequence, tmp_path, capsys):
     assert run(sequence, tmp_path / "out") == 0
     out, err = capsys.readouterr()
     assert "ADD-S" in out and "object" in out
-    assert out.splitlines()[-1] == f"Results in {tmp_path / 'out'}. Next: p2p eval {tmp_path / 'out'} --json"
+    results = f"Results in {tmp_path / 'out'}, first masks in {tmp_path / 'out/first_masks.png'}."
+    assert out.splitlines()[-1] == f"{results} Next: p2p eval {tmp_path / 'out'} --json"
     assert err == ""
 
 
@@ -279,7 +280,10 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert now.info["finished"] and (out / "poses/object.txt").read_text() == (done / "poses/object.txt").read_text()
     before = contents(out)
     assert run(sequence, out, *words) == 0
-    assert "which is finished" in capsys.readouterr().err and contents(out) == before
+    assert "which is finished" in (err := capsys.readouterr().err) and contents(out) == before and "left out" not in err
+    assert cli.main(["run", str(sequence), "--out", str(out), "--resume", "--quiet"]) == 0 and contents(out) == before
+    taken = f"left out, and taken from the run in {out}: --set method.surface=false --set method.graph=false --seed 7"
+    assert taken in capsys.readouterr().err.replace("'", "")
     assert run(sequence, out, "--seed", "8", "--resume") == 2
     got = "out: the run to go on with: got --seed 8, expected --seed 7, as it began. Ask for the same, or run it anew"
     assert got in one_line(capsys)
@@ -294,6 +298,19 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert "config.toml: got other parameters" in one_line(capsys)
     before["config.toml"] += b"\n"
     assert contents(out) == before
+
+
+def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys):
+    (shelf := tmp_path / "shelf").mkdir()
+    shutil.move(sequence, shelf / "one")
+    words = ["run", "--batch", str(shelf), "--out", str(tmp_path / "out"), "--jobs", "1", *POINTS_ALONE]
+    assert cli.main([*words, *clicks(tmp_path, ("object", 0, [[60, 50]])), "--stop", "2"]) == 0
+    capsys.readouterr()
+    table = (tmp_path / "out/batch.csv").read_bytes()
+    assert cli.main([*words, "--stop", "2"]) == 2
+    assert "out/one: the run to go on with: got no --prompts, expected --prompts" in (line := one_line(capsys))
+    assert "Nothing was run, and the table is as it was." in line and not (tmp_path / "out/failures").exists()
+    assert (tmp_path / "out/batch.csv").read_bytes() == table
 
 
 def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsys, monkeypatch):
@@ -497,7 +514,8 @@ def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(seque
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):
     """The board is 60 px wide half a metre away: 15 cm."""
     run(sequence, tmp_path / "run", "--size", "object=15")
-    assert "known to be" not in capsys.readouterr().out
+    fits = re.compile(r"^object: 1\d\.\d cm by its masks, 15 cm given: fits$", re.MULTILINE)
+    assert "known to be" not in (out := capsys.readouterr().out) and fits.search(out)
     run(sequence, tmp_path / "other", "--size", "object=7")
     assert re.search(
         r"object: known to be 7\.0 cm long, measured 1\d\.\d cm in its masks, 2\.\d+ times", capsys.readouterr().out
@@ -505,7 +523,9 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
     assert cli.main(["eval", str(tmp_path / "other")]) == 0
     assert "known to be 7.0 cm long" in capsys.readouterr().err, "as the run was told"
     assert cli.main(["eval", str(tmp_path / "other"), "--size", "object=15"]) == 0
-    assert "known to be" not in capsys.readouterr().err
+    assert "known to be" not in (said := capsys.readouterr()).err and fits.search(said.out)
+    assert cli.main(["eval", str(tmp_path / "run"), "--json"]) == 0
+    assert "fits" not in capsys.readouterr().out
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=40"]) == 0
     assert "or its length was never in view" in capsys.readouterr().err
     third = ["run", str(sequence), "--out", str(tmp_path / "third")]
@@ -533,7 +553,7 @@ def test_why_a_run_is_not_scored_is_said_once(sequence, tmp_path, capsys):
     """Behind what says already which run it is."""
     shutil.rmtree(sequence / "models")
     assert run(sequence, tmp_path / "run") == 0
-    assert f"Results in {tmp_path / 'run'}; not scored, object: no model for ADD" in capsys.readouterr().out
+    assert "first_masks.png; not scored, object: no model for ADD" in capsys.readouterr().out
     assert cli.main(["eval", str(tmp_path / "run")]) == 0
     assert "Not scored: object: no model for ADD" in capsys.readouterr().out
 
@@ -741,7 +761,16 @@ BAD_WORDS = {
     "model not there": (["run", "{seq}", "--out", "{out}", "--models", "object=/no.obj"], ["/no.obj", "no such model"]),
     "model of nobody": (["run", "{seq}", "--out", "{out}", "--models", "mug={seq}"], ["'mug'", "object"]),
     "out is a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt"], ["cam_K.txt", "a folder for the results"]),
-    "out within a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt"]),
+    "out within a file": (["run", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x: got what cannot be written"]),
+    "out is no place to write": (
+        ["export", "{done}", "--format", "tum", "--out", "/proc/x"],
+        ["--out /proc/x: got what cannot be written", "expected a folder that can be written. Name another one."],
+    ),
+    "film into a folder": (["film", "{done}", "--out", "{seq}"], ["--out", "slide: got a folder, expected a file"]),
+    "a film that cannot be": (
+        ["run", "{seq}", "--out", "{out}", "--overlay", "/proc/x.mp4"],
+        ["--overlay /proc/x.mp4"],
+    ),
     "export of too little": (
         ["export", "{done}", "--format", "tum", "--out", "{out}", "--min-confidence", "-0.1"],
         ["min_confidence", "-0.1"],

@@ -121,6 +121,26 @@ def test_a_run_as_a_film_has_its_masks_keypoints_and_seconds(made, tmp_path):
     assert len(frames) == len(playback) and frames[0].shape == (120, 160, 3)
 
 
+def test_a_film_outlines_the_surfaces_at_their_poses_where_that_is_asked_for(made, tmp_path):
+    """A ball of 4 cm at each object's origin: white where its rim is seen, and the rest of the image as without."""
+    import trimesh
+
+    run, row = shutil.copytree(made.run.path, tmp_path / "run"), 2
+    (name, obj), *_ = made.run.objects.items()
+    (run / "meshes").mkdir(exist_ok=True)
+    trimesh.creation.icosphere(radius=0.04).export(run / "meshes" / f"{name}.ply")
+    playback = Playback.of(run, made.sequence)
+    shown = playback.silhouettes(row)[name]
+    u, v = made.sequence.camera.project(obj.T_cam_obj[row][None, :3, 3])[0]
+    np.testing.assert_allclose(np.argwhere(shown).mean(0), (v, u), atol=1.5)
+    plain, outlined = (Scene.of(playback, surfaces).draw(row, words=False).astype(int) for surfaces in (False, True))
+    changed = np.argwhere((plain != outlined).any(-1))
+    away_px = np.abs(np.linalg.norm(changed - (v, u), axis=1) - np.sqrt(shown.sum() / np.pi))
+    assert len(changed) > 50 and away_px.max() < 5
+    frames = [decoded(write_film(run, tmp_path / f"{of}.mp4", made.sequence, surfaces=of))[0] for of in (0, 1)]
+    assert any((a != b).any() for a, b in zip(*frames))
+
+
 def test_seconds_count_from_the_start(made):
     """A camera's clock may begin anywhere."""
     later = {k: replace(obj, time_s=obj.time_s + 1.6e9) for k, obj in made.run.objects.items()}
