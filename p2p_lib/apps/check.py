@@ -31,7 +31,7 @@ from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera, sees
 from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size
-from p2p_lib.datasets.image_sequence import WRITE_K, paired_images
+from p2p_lib.datasets.image_sequence import WRITE_K, paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
@@ -215,7 +215,11 @@ def _files(folder: Path) -> list[Finding]:
             wrong.append(_unreadable(name, error, fix))
 
     def first(part: str, suffixes: tuple[str, ...], read: Callable[[Path], np.ndarray]) -> None:
-        files = look(f"{part}/", _PUT[part], lambda: images.list_files(folder / part, suffixes, f"{part} images"))
+        files = look(
+            f"{part}/",
+            images.called_otherwise(folder / part) or _PUT[part],
+            lambda: images.list_files(folder / part, suffixes, f"{part} images"),
+        )
         if files:
             look(f"{part}/", _REPLACE, lambda: read(files[0]))
 
@@ -223,8 +227,7 @@ def _files(folder: Path) -> list[Finding]:
     first("depth", images.DEPTH, images.read_raw_depth)
     if not wrong:
         look("depth/", "", lambda: paired_images(folder))
-    K = "a 3x3 camera matrix in pixels"
-    look("cam_K.txt", _PUT["K"], lambda: Camera.from_K(images.read_numbers(folder / "cam_K.txt", K), 1, 1, "cam_K.txt"))
+    look("cam_K.txt", "", lambda: Camera.from_K(read_K(folder), 1, 1, "cam_K.txt"))
     for path in (path for path in (folder / "times.txt", folder / "depth_scale.txt") if path.exists()):
         look(path.name, "It is optional: correct it or remove it.", partial(images.read_numbers, path, "numbers"))
     return wrong

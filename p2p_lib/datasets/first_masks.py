@@ -1,6 +1,6 @@
 """``first_masks.png`` of a run: what prompts made, the objects' first masks and corrected ones, drawn at that moment.
 
-The frame with every object's outline, clicks and box, and below it each object by itself, with its name and pixels:
+The frame with every object's outline, clicks and box, and beside it each object by itself, with its name and pixels:
 whoever sees that a mask is not the object stops there and clicks again.
 """
 
@@ -20,8 +20,8 @@ from p2p_lib.datasets.images import save_png
 
 FILE = "first_masks.png"
 _FONT, _WHITE = cv2.FONT_HERSHEY_SIMPLEX, (255, 255, 255)
-#: Of objects by themselves: their height at least, px, the most of them in a row, and the room around, a share of one.
-_CLOSE_PX, _ACROSS, _ROOM = 240, 4, 0.3
+#: Of objects by themselves: their height at least, px, and the room around, a share of one.
+_CLOSE_PX, _ROOM = 240, 0.3
 #: The outline of a larger object is thicker.
 _LARGE_PX = 10_000
 #: Frames with corrections that are shown, the newest ones.
@@ -49,7 +49,7 @@ class FirstMasks:
         again = {name: mask for name, mask in seen.items() if name in self._followed & now}
         self._followed |= new.keys()
         self._started = list(dict.fromkeys([*self._started, *new]))
-        colours = object_colours(dict.fromkeys([*(prompt.name for prompt in self._prompts), *self._started]))  # a run's
+        colours = object_colours(dict.fromkeys([*(prompt.name for prompt in self._prompts), *self._started]))
         for title, drawn, panels in (("first", new, self._panels), ("corrected", again, self._corrected)):
             if drawn:
                 prompts = [newest[name] for name in drawn if name in newest]
@@ -66,7 +66,7 @@ class FirstMasks:
 def _panel(
     frame: Frame, masks: Mapping[str, np.ndarray], prompts: Iterable[Prompt], colours: Mapping[str, str], title: str
 ) -> np.ndarray:
-    """A frame with outlines and prompts, and below it each object by itself."""
+    """A frame with outlines and prompts, and beside it each object by itself."""
     image = frame.rgb.copy()
     for name, mask in masks.items():
         outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -74,15 +74,19 @@ def _panel(
         cv2.drawContours(image, outlines, -1, rgb(colours[name]), thick)
     # Enlarged before anything thick is drawn, so that it covers none of a small object.
     side_px = {name: int(np.ceil(max(_size_px(mask)) * (1 + 2 * _ROOM))) for name, mask in masks.items()}
-    height_px = max(_CLOSE_PX, *side_px.values())  # none is smaller than in the frame
+    least_px = max(_CLOSE_PX, *side_px.values())  # none is smaller than in the frame
+    # In a square beside the frame, as high as it, so that nothing is left empty but the end of the last row.
+    rows = int(np.ceil(np.sqrt(len(masks))))
+    height_px = max(least_px, -(-image.shape[0] // rows))
     parts = [_close(image, masks[name], name, prompts, colours[name], side_px[name], height_px) for name in masks]
     _draw_prompts(image, prompts, colours, 1.0, np.zeros(2))
+    height = rows * height_px
+    image = cv2.resize(image, (round(image.shape[1] * height / image.shape[0]), height))
     _write(image, title)
-    blank = [np.zeros_like(parts[0])] * (-len(parts) % _ACROSS if len(parts) > _ACROSS else 0)
-    parts = [*parts, *blank]
-    rows = [np.concatenate(parts[k : k + _ACROSS], 1) for k in range(0, len(parts), _ACROSS)]
-    width = max(image.shape[1], rows[0].shape[1])
-    return np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in (image, *rows)])
+    parts += [np.zeros_like(parts[0])] * (-len(parts) % rows)
+    across = len(parts) // rows
+    beside = np.concatenate([np.concatenate(parts[k : k + across], 1) for k in range(0, len(parts), across)])
+    return np.concatenate([image, beside], 1)
 
 
 def _size_px(mask: np.ndarray) -> tuple[int, int]:

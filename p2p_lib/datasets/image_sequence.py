@@ -168,8 +168,13 @@ def image_files(folder: Path) -> ImageSequence:
 
 
 def read_K(folder: Path) -> np.ndarray:
-    """(3, 3) the camera matrix in ``cam_K.txt``; :class:`MissingData` says what to write where there is none."""
+    """(3, 3) the camera matrix in ``cam_K.txt``, in three lines or in one; errors say what to write."""
+    path, expected = folder / "cam_K.txt", "a 3x3 camera matrix in pixels"
     try:
-        return images.read_numbers(folder / "cam_K.txt", "a 3x3 camera matrix in pixels")
+        K = images.read_numbers(path, expected)
     except MissingData as error:
         raise advised(error, WRITE_K) from None
+    if K.size != 9:
+        decimals = "A comma parts numbers: write decimals with a point, as 913.05."
+        raise BadInput(str(path), f"{K.size} numbers", expected, decimals if K.size == 18 else WRITE_K)
+    return K.reshape(3, 3)

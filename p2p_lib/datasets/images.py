@@ -73,12 +73,19 @@ def full(folder: Path) -> Path:
 def list_files(folder: Path, suffixes: tuple[str, ...], what: str) -> tuple[Path, ...]:
     """The files of a folder in natural order (2 before 10); at least one, or an error that names the folder."""
     if not folder.is_dir():
-        fix = "p2p check FOLDER says what else is missing."
+        fix = f"{called_otherwise(folder)} p2p check FOLDER says what else is missing.".strip()
         raise MissingData(str(folder), f"no such folder, expected {what} there", fix)
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     if not files:
         raise BadInput(str(folder), "no files", f"{what} ({' '.join(suffixes)})")
     return tuple(sorted(files, key=_natural))
+
+
+def called_otherwise(folder: Path) -> str:
+    """What to do where a folder is there under a name that other recorders give it; empty where it is not."""
+    names = {"rgb": ("rgb", "color", "colour", "images"), "depth": ("depth",)}.get(folder.name, (folder.name,))
+    near = [path for path in sorted(folder.parent.glob("*/")) if path.name.lower() in names and path != folder]
+    return f"Rename {near[0].name}/ to {folder.name}/." if near else ""
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -30,7 +30,9 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     rgb, depth = paired_images(folder, "color")
     path = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
     if path is None:
-        raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", "Open3D's recorder writes it beside color/.")
+        fix = "Open3D's recorder writes it beside color/."
+        fix = "Rename color/ to rgb/: cam_K.txt is read beside that." if (folder / "cam_K.txt").is_file() else fix
+        raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", fix)
     # It is written column by column.
     K = np.array(read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it").intrinsic_matrix).reshape(3, 3).T
     files = ImageSequence(folder, rgb, depth, camera_for(rgb, K, str(path)), images.frame_times(folder, rgb))

@@ -20,7 +20,7 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.plugins import find, offered
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.images import gaps_allowed
+from p2p_lib.datasets.images import called_otherwise, gaps_allowed
 
 #: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
 FORMATS: dict[str, tuple[str, ...]] = {
@@ -243,6 +243,7 @@ def recognise(folder: Path) -> str:
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
     if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
         fix = "rgb/ is missing: put the colour images there, one for each depth image."
+        fix = called_otherwise(folder / "rgb") or fix
         raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
     fix = f"Name the layout with --format ({', '.join(FORMATS)})."
     if _layout(folder.parent):

@@ -35,18 +35,18 @@ if TYPE_CHECKING:
 LOOKS = 60
 #: What the numbers are called, what they say, and which way is good.
 HEADS = {
-    "pose": ("pose [%]", "frames with a pose"),
-    "doubted": ("doubted [%]", f"of these poses, those of confidence {DOUBTED:g} at most: 0 is best"),
-    "pose_where_seen": ("where seen [%]", f"the same of frames whose mask has {MIN_VISIBLE_PX} pixels: 100 is best"),
+    "pose": ("pose [%]", ""),
+    "doubted": ("doubted [%]", f"of confidence {DOUBTED:g} at most"),
+    "pose_where_seen": ("where seen [%]", f"a pose where the mask has {MIN_VISIBLE_PX} pixels"),
     "depth_on_surface": (
         "depth on surface [%]",
-        f"of the surface in view, where depth lies within {1000 * ON_M:g} mm of it, or its noise there: 100 is best",
+        f"of the surface in view, within {1000 * ON_M:g} mm or noise",
     ),
     "mask_iou": (
         "mask IoU [%]",
-        "overlap of the surface's outline, where nothing hides it, with the mask: 100 is best",
+        "of the surface's unhidden outline with the mask",
     ),
-    "reprojection_px": ("reprojection [px]", "from keypoints at the pose to where they were seen: 0 is best"),
+    "reprojection_px": ("reprojection [px]", "keypoints at the pose to where they were seen"),
 }
 #: Measured from clicks on three real sequences as tracked, and on two of them with every pose put off by 1 cm.
 SCALE = (
@@ -91,7 +91,8 @@ class Consistency:
 
     def as_table(self) -> str:
         """The same for people, with what each number says."""
-        legend = [f"{head}: {says}" for head, says in HEADS.values()]
+        said = {key for numbers in self.objects.values() for key, value in numbers.items() if np.isfinite(value)}
+        legend = ["; ".join(f"{head}: {says}" for key, (head, says) in HEADS.items() if key in said and says)]
         hz = [f"{self.hz:.1f} Hz"] if self.hz is not None else []
         ran = ", ".join(f"{key} {value}" for key, value in ran_with(self.info).items())
         without = f"Not scored: {self.not_scored}.\nWithout a model" if self.not_scored else "Without truth"

@@ -692,7 +692,7 @@ BAD_FILES = {
     "small mask": (lambda s: image(s / "gt_mask/0002.png", np.ones((6, 8), np.uint8)), ["gt_mask/0002.png", "8x6"]),
     "empty sequence": (no_pictures, ["rgb", "no files"]),
     "no depth folder": (lambda s: shutil.rmtree(s / "depth"), ["depth"]),
-    "K of two rows": (lambda s: spoil(s / "cam_K.txt", b"600 0 320\n0 600 240\n"), ["cam_K.txt", "(2, 3)", "3x3"]),
+    "K of two rows": (lambda s: spoil(s / "cam_K.txt", b"600 0 320\n0 600 240\n"), ["cam_K.txt", "6 numbers", "3x3"]),
     "K of words": (lambda s: spoil(s / "cam_K.txt", b"fx fy cx\n"), ["cam_K.txt", "'fx'", "3x3"]),
     "K transposed": (lambda s: np.savetxt(s / "cam_K.txt", K.T), ["cam_K.txt", "fx 0 cx 0 fy cy 0 0 1"]),
     "no K": (lambda s: spoil(s / "cam_K.txt", None), ["cam_K.txt"]),

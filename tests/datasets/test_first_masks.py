@@ -8,7 +8,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.first_masks import FirstMasks
 
-H, W = 120, 160
+H, W = 240, 320
 GRAY = 90
 
 
@@ -62,16 +62,20 @@ def test_no_object_is_smaller_by_itself_than_in_the_frame(tmp_path):
     mask[100:500, 100:600] = True
     frame = Frame(0, 0.0, np.full((600, 800, 3), GRAY, np.uint8), np.ones((600, 800), np.float32))
     FirstMasks(tmp_path / "first.png").add(frame, {"book": mask, "pin": square(10, 10, 10, mask.shape)})
-    red = (read(tmp_path / "first.png")[600:] == np.array(rgb(OBJECTS[0]))).all(-1)
-    rows, columns = np.nonzero(red[:, :800])
+    red = (read(tmp_path / "first.png")[:, 800:] == np.array(rgb(OBJECTS[0]))).all(-1)
+    rows, columns = np.nonzero(red)
     assert np.ptp(columns) >= 499 and np.ptp(rows) >= 399
 
 
 def test_eight_objects_fit(tmp_path):
-    masks = {f"a long name of object {k}": square(10 + 50 * (k // 4), 5 + 35 * (k % 4), 20) for k in range(8)}
-    assert len(FirstMasks(tmp_path / "first.png").add(picture(0), masks)[0]) == 8
-    image = read(tmp_path / "first.png")
-    assert image.shape == (H + 2 * 240, 4 * 240, 3)
+    frame = Frame(0, 0.0, np.full((480, 640, 3), GRAY, np.uint8), np.ones((480, 640), np.float32))
+    # In a square beside the frame, which is as high: nothing is left empty but the end of the last row.
+    for objects, shape in ((1, (480, 640 + 480)), (2, (480, 640 + 240)), (8, (720, 960 + 3 * 240))):
+        at = [(10 + 50 * (k // 4), 5 + 35 * (k % 4)) for k in range(objects)]
+        masks = {f"a long name of object {k}": square(*corner, 20, (480, 640)) for k, corner in enumerate(at)}
+        assert len(FirstMasks(tmp_path / "first.png").add(frame, masks)[0]) == objects
+        image = read(tmp_path / "first.png")
+        assert image.shape == (*shape, 3) and (image.max(-1) > 0).mean() > 0.92
 
 
 def test_corrections_are_drawn_below_the_newest_ones_of_many(tmp_path):

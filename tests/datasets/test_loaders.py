@@ -93,9 +93,13 @@ FAULTS = {
     ),
     "no depth folder": ("depth", None, "depth: no such folder, expected depth images"),
     "no camera": ("cam_K.txt", None, rf"cam_K\.txt: no such file, {MATRIX}"),
-    "camera of two rows": ("cam_K.txt", "50 0 20\n0 50 15\n", rf"cam_K\.txt: got shape \(2, 3\), {MATRIX}"),
-    "camera of one row": ("cam_K.txt", "50 0 20 0 50 15 0 0 1", rf"cam_K\.txt: got shape \(1, 9\), {MATRIX}"),
-    "camera empty": ("cam_K.txt", "", rf"cam_K\.txt: got shape \(0,\), {MATRIX}"),
+    "camera of two rows": ("cam_K.txt", "50 0 20\n0 50 15\n", rf"cam_K\.txt: got 6 numbers, {MATRIX}"),
+    "camera with decimal commas": (
+        "cam_K.txt",
+        "50,5 0,0 20,0\n0,0 50,5 15,0\n0,0 0,0 1,0\n",
+        "18 numbers.*with a point",
+    ),
+    "camera empty": ("cam_K.txt", "", rf"cam_K\.txt: got 0 numbers, {MATRIX}"),
     "camera in words": ("cam_K.txt", "fx 50\nfy 50\n", rf"cam_K\.txt: got unreadable numbers .*'fx'.*, {MATRIX}"),
     "camera ragged": (
         "cam_K.txt",
@@ -168,6 +172,18 @@ def test_fault_names_the_file(sequence, fault):
     file, content, expected = FAULTS[fault]
     put(sequence / file, content)
     assert_named(sequence, expected)
+
+
+def test_a_camera_matrix_may_stand_in_one_line(sequence):
+    put(sequence / "cam_K.txt", "50 0 20 0 51 15 0 0 1")
+    camera = open_sequence(sequence).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 51, 20, 15)
+
+
+@pytest.mark.parametrize("mine, ours", [("Depth", "depth"), ("RGB", "rgb"), ("color", "rgb")])
+def test_a_folder_of_another_name_is_to_be_renamed(sequence, mine, ours):
+    (sequence / ours).rename(sequence / mine)
+    assert_named(sequence, f"Rename {mine}/ to {ours}/")
 
 
 def test_a_picture_cut_off_is_named(sequence):

@@ -146,8 +146,10 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
     assert "unknown, box: no pose was compared" in said.as_table() and "keypoints were kept" in said.as_table()
     unscored = replace(said, not_scored="no model of 'box'")
     assert unscored.as_dict()["truth"] is None and unscored.as_dict()["not_scored"] == "no model of 'box'"
-    for head, says in HEADS.values():
-        assert head in said.as_table() and says in said.as_table()
+    assert all(head in said.as_table() for head, _ in HEADS.values())
+    for key, (_, says) in HEADS.items():
+        assert says in consistency(run, made.sequence).as_table()
+        assert not says or (says in said.as_table()) == (key == "doubted"), "of what has a number alone"
 
 
 def test_far_depth_is_as_near_to_the_surface_as_a_camera_measures_it():
