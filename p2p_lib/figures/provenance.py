@@ -151,7 +151,8 @@ def describe(source: Any) -> dict[str, Any]:
         return {"evaluation": _what_ran(source.info), "align": source.align}
     if isinstance(source, Benchmark):
         keys = sorted({outcome.key for _, outcome in source.results if outcome.status == "done"})
-        source_info = {"benchmark": source.plan.name, "profile": source.profile, "plan": _plan_digest(source.plan)}
+        source_info = {"benchmark": source.plan.name, "profile": source.profile}
+        source_info["plan"] = _plan_digest(source.plan, source.profile)
         return {**source_info, "cpu_min": round(source.cpu_min, 1), "runs": keys}
     if isinstance(source, str | Path):
         return {"file": Path(source).name, "sha256": _sha256(Path(source))}
@@ -170,14 +171,16 @@ def earlier(note: Mapping[str, Any]) -> bool:
     for source in note["sources"]:
         if "benchmark" in source:
             measured |= bool(source["runs"])
-            if source.get("plan") != _plan_digest(read_plan(source["benchmark"])):
+            if source.get("plan") != _plan_digest(read_plan(source["benchmark"]), source["profile"]):
                 return True
         measured |= "run" in source or "evaluation" in source
     return measured and note.get("code") != code_digest()
 
 
-def _plan_digest(plan: Plan) -> str:
-    return hashlib.sha256(plan.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:12]
+def _plan_digest(plan: Plan, profile: str) -> str:
+    """Of what decides the profile's results: what its other one runs does not."""
+    text = plan.model_dump_json(exclude_defaults=True, exclude={"quick", "full"} - {profile})
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _plain_words(caption: str) -> str:
