@@ -178,21 +178,23 @@ def outlier_trials(seeds: Iterable[int], config: Config, outliers: float) -> Dat
     return DataFrame(rows)
 
 
-def consistency(trials: int, config: Config, seed: int = 0, told: Config | None = None, **turn: Any) -> np.ndarray:
+def consistency(trials: int, config: Config, told: Sequence[Config], seed: int = 0, **turn: Any) -> list[np.ndarray]:
     """(trials, 2) normalised squared errors of the newest keyframe, rotation and translation, by its covariance.
 
-    told  what the graph is configured by, where that is not what the turn is simulated with
+    told  what the graph is configured by, with an answer for each; ``config`` simulates and registers the turns
 
     Each is e^T Sigma^-1 e of three numbers, distributed as chi square of 3 if the covariance is honest: median 2.37.
     """
-    rows = []
+    rows: list[list] = [[] for _ in told]
     for trial in range(trials):
         one = simulate_turn(np.random.default_rng([seed, trial]), config, **turn)
-        solved = optimise(one, register_turn(one, config, trial), told or config)
-        if solved.covariance is not None:
-            e, C = se3.log(se3.inverse(solved.T_cam_obj[-1]) @ one.T_cam_obj[-1]), solved.covariance
-            rows.append([e[k] @ np.linalg.solve(C[k, k], e[k]) for k in (slice(0, 3), slice(3, 6))])
-    return np.array(rows)
+        registered = register_turn(one, config, trial)
+        for graph, found in zip(told, rows, strict=True):
+            solved = optimise(one, registered, graph)
+            if solved.covariance is not None:
+                e, C = se3.log(se3.inverse(solved.T_cam_obj[-1]) @ one.T_cam_obj[-1]), solved.covariance
+                found.append([e[k] @ np.linalg.solve(C[k, k], e[k]) for k in (slice(0, 3), slice(3, 6))])
+    return [np.array(found) for found in rows]
 
 
 #: The line of each way, the same in every plot; told apart without colour too.

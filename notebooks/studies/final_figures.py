@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -15,7 +15,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from pandas import read_csv, to_numeric
 
-from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark
+from p2p_lib.benchmark.execution import measured, perform
+from p2p_lib.benchmark.jobs import library_version
+from p2p_lib.benchmark.outcome import save_outcome
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets.keypoint_log import load_keypoints
@@ -34,6 +37,17 @@ from studies import SHIPPED, mesh_view
 
 if TYPE_CHECKING:
     from IPython.display import Markdown
+
+
+def run_quick_here(plans: Iterable[str], out: Path) -> None:
+    """Run in this process what ``out`` lacks of the quick form of plans.
+
+    A process of its own, as ``p2p benchmark`` has for each run, takes as long to begin as one of these runs takes.
+    """
+    for plan in plans:
+        for job, outcome in load_benchmark(plan, out, "quick").results:
+            if job.key and outcome.status == "not run":
+                save_outcome(out, perform(measured, job, out, library_version()))
 
 
 def shown_table(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Markdown:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -85,6 +86,7 @@ class Moment:
         return se3.error_deg_mm(T_cam_obj, self.T_cam_obj)
 
 
+@lru_cache(maxsize=1)  # the trials begin with the mug that the notebook shows
 def mug_moment(config: Config, seed: int = 0) -> Moment:
     """Points sampled on ``synthetic/mug`` and tracked while the handle comes into view."""
     scenario, rng = mug(seed, marks=2), np.random.default_rng([seed, 7])

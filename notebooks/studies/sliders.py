@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from p2p_lib.core.errors import BadInput
@@ -68,9 +69,11 @@ def save_sliders(
 def _embedded(picture: Any) -> str:
     """A drawn picture as an address that holds it."""
     if not isinstance(picture, np.ndarray):
-        with style.applied(), io.BytesIO() as png:
-            picture.savefig(png, format="png", dpi=_FINE * picture.dpi)
-            picture = np.asarray(Image.open(png).convert("RGB"))
+        with style.applied():  # drawn once, where savefig draws twice and packs what is packed again below
+            canvas = FigureCanvasAgg(picture)
+            picture.set_dpi(_FINE * picture.dpi)
+            canvas.draw()
+            picture = np.asarray(canvas.buffer_rgba())[..., :3]
     with io.BytesIO() as webp:
         Image.fromarray(picture).save(webp, "WEBP", quality=70, method=4)
         return "data:image/webp;base64," + base64.b64encode(webp.getvalue()).decode()

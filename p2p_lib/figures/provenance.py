@@ -2,8 +2,8 @@
 
 Figures and films go to ``$P2P_FIGURES`` (else ``figures/`` of the project), tables to ``$P2P_TABLES`` (else
 ``out/tables/``). Beside ``NAME.png`` lies ``NAME.json``: parameters, what was read, versions, commit, and a digest of
-the code that decides the numbers. Neither holds a time or a folder of this machine, so that the same work gives the
-same bytes.
+the code that decides the numbers; of a notebook's quick profile without the digest, which takes a second. Neither
+holds a time or a folder of this machine, so that the same work gives the same bytes.
 """
 
 from __future__ import annotations
@@ -69,25 +69,29 @@ def save_figure(
 ) -> Saved:
     """Write a Matplotlib figure as PNG and PDF, or an image (H, W, 3) uint8 as PNG, with its note.
 
+    Of a quick form a PNG alone, and not as small as it could be: to draw twice and to pack tightly takes longest.
+
     caption     whole sentences that say what is seen to somebody who reads nothing else; also the alternative text
     sources     what it was drawn from: runs, evaluations, sequences, files
     parameters  what decided how it was made: profile, seed, ...
     to          another folder than that of the figures
     """
     sources = list(sources)
-    target = _target(to or paths.figure_dir(), name, _is_quick(sources, parameters))
+    quick = _is_quick(sources, parameters)
+    target = _target(to or paths.figure_dir(), name, quick)
     png = target.with_name(f"{name}.png")
     if isinstance(figure, np.ndarray):
         if figure.ndim != 3 or figure.shape[2] != 3 or figure.dtype != np.uint8:
             raise BadInput(f"figure {name}", f"{figure.shape} {figure.dtype}", "(H, W, 3) uint8, red first")
-        Image.fromarray(figure).save(png, optimize=True)
+        Image.fromarray(figure).save(png, optimize=not quick)
         width_px, suffixes, drawn_with = figure.shape[1], [".png"], []
     else:
         with style.applied():
             figure.savefig(png, metadata={"Software": None})
-            figure.savefig(png.with_suffix(".pdf"), metadata={"CreationDate": None})
+            if not quick:
+                figure.savefig(png.with_suffix(".pdf"), metadata={"CreationDate": None})
             width_px = round(figure.get_figwidth() * figure.dpi)
-        suffixes, drawn_with = [".png", ".pdf"], ["matplotlib"]
+        suffixes, drawn_with = [".png"] if quick else [".png", ".pdf"], ["matplotlib"]
     _write_note(target, suffixes, sources, parameters, drawn_with, caption)
     shown = {"image/png": base64.b64encode(png.read_bytes()).decode(), "text/plain": f"<{name}.png>"}
     look = {"width": min(width_px, _SHOWN_PX), "alt": _plain_words(caption) or name.replace("_", " ")}
@@ -151,7 +155,8 @@ def describe(source: Any) -> dict[str, Any]:
         return {"evaluation": _what_ran(source.info), "align": source.align}
     if isinstance(source, Benchmark):
         keys = sorted({outcome.key for _, outcome in source.results if outcome.status == "done"})
-        source_info = {"benchmark": source.plan.name, "profile": source.profile, "plan": _plan_digest(source.plan)}
+        source_info = {"benchmark": source.plan.name, "profile": source.profile}
+        source_info["plan"] = _plan_digest(source.plan, source.profile)
         return {**source_info, "cpu_min": round(source.cpu_min, 1), "runs": keys}
     if isinstance(source, str | Path):
         return {"file": Path(source).name, "sha256": _sha256(Path(source))}
@@ -170,14 +175,16 @@ def earlier(note: Mapping[str, Any]) -> bool:
     for source in note["sources"]:
         if "benchmark" in source:
             measured |= bool(source["runs"])
-            if source.get("plan") != _plan_digest(read_plan(source["benchmark"])):
+            if source.get("plan") != _plan_digest(read_plan(source["benchmark"]), source["profile"]):
                 return True
         measured |= "run" in source or "evaluation" in source
     return measured and note.get("code") != code_digest()
 
 
-def _plan_digest(plan: Plan) -> str:
-    return hashlib.sha256(plan.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:12]
+def _plan_digest(plan: Plan, profile: str) -> str:
+    """Of what decides the profile's results: what its other one runs does not."""
+    text = plan.model_dump_json(exclude_defaults=True, exclude={"quick", "full"} - {profile})
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _plain_words(caption: str) -> str:
@@ -225,12 +232,13 @@ def _write_note(
     made = provenance()
     made["versions"] |= {name: version(name) for name in drawn_with}
     files = {f"{target.name}{suffix}": _sha256(target.with_name(f"{target.name}{suffix}")) for suffix in suffixes}
+    quick = (parameters or {}).get("PROFILE") == "quick"
     note = {
         **({"caption": caption} if caption else {}),
         "parameters": dict(parameters or {}),
         "sources": [describe(source) for source in sources],
         **made,
-        "code": code_digest(),
+        **({} if quick else {"code": code_digest()}),
         "sha256": files,
     }
     path, text = target.with_name(f"{target.name}.json"), json.dumps(note, ensure_ascii=False, default=_plain)

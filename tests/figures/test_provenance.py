@@ -50,7 +50,7 @@ def test_saved_again_is_the_same_to_the_byte(made, folders):
         contents.append({p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()})
     assert contents[0] == contents[1]
     assert {str(p) for p in contents[0]} == {
-        *(f"figures/{name}" for name in ("plot.png", "plot.pdf", "plot.json", "picture.png", "picture.json")),
+        *(f"figures/{name}" for name in ("plot.png", "plot.json", "picture.png", "picture.json")),
         *("figures/film.mp4", "figures/film.json", "tables/scores.csv", "tables/scores.md", "tables/scores.json"),
     }
 

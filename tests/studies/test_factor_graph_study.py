@@ -70,7 +70,7 @@ def test_a_bounded_graph_merges_keyframes(turn):
 
 
 def test_covariance_is_honest_where_observations_count_once():
-    nees = consistency(60, WITHOUT_REG, 9, keyframes=8, points=50)
+    (nees,) = consistency(60, WITHOUT_REG, (WITHOUT_REG,), 9, keyframes=8, points=50)
     assert len(nees) > 45 and (nees.mean(0) > 1.5).all() and (nees.mean(0) < 6).all()
 
 

@@ -67,7 +67,8 @@ def test_whatever_earlier_code_made_says_so():
 
 def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeypatch):
     (tmp_path / "tables").mkdir()
-    runs = {"benchmark": "readme", "plan": provenance._plan_digest(read_plan("readme")), "runs": ["a"], "cpu_min": 7.0}
+    plan = {"benchmark": "readme", "profile": "full", "plan": provenance._plan_digest(read_plan("readme"), "full")}
+    runs = {**plan, "runs": ["a"], "cpu_min": 7.0}
     note = {"parameters": {"commit": "c" * 40}, "sources": [runs], "code": code_digest(), "sha256": {}}
     (tmp_path / "tables/readme.json").write_text(json.dumps(note))
     (tmp_path / "tables/readme.md").write_text("| 1 |\n")
@@ -87,7 +88,7 @@ def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeyp
     monkeypatch.setattr(provenance, "code_digest", lambda: note["code"])
     anew.say_so(tmp_path)
     assert (tmp_path / "tables/readme.md").read_text() == "| 1 |\n"
-    monkeypatch.setattr(provenance, "_plan_digest", lambda plan: "another")
+    monkeypatch.setattr(provenance, "_plan_digest", lambda plan, profile: "another")
     assert untold(tmp_path) == ["tables/readme.md"], "its plan asks for something else by now"
     (tmp_path / "tables/readme.json").write_text(json.dumps(note | {"sources": [runs | {"runs": []}]}))
     assert untold(tmp_path) == ["tables/readme.md"], "a table of dashes has rows of its plan, too"
