@@ -134,11 +134,10 @@ def _run(a: argparse.Namespace) -> int:
     results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:
         print(result.evaluation.as_table())
-        print(f"{results}. Next: p2p eval {a.out} --json")
     elif a.out.is_dir():
-        print(
-            f"{results}; not scored, {_reason(result.not_scored, a.out)}." + f" Next: p2p view {a.out}" * result.tracked
-        )
+        results += f"; not scored, {_reason(result.not_scored, a.out)}"
+    if a.out.is_dir():
+        print(f"{results}." + f" Next: p2p view {a.out}" * result.tracked)
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:

@@ -116,7 +116,7 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     about = _about(made, name, textured, len(views), off)
     about |= {"masks_beside": round(off_model, 4), "collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-    guessed = f", {100 * about['guessed_share']:.0f} % of its area guessed" if shape.guessed.any() else ""
+    guessed = f", {100 * about['guessed_share']:.0f} % of its area unseen, guessed" if shape.guessed.any() else ""
     textured_of = f"texture of {len(views)} view{'s' * (len(views) != 1)}"
     line = f"{name}: {len(shape.faces)} faces, {textured_of}{guessed}{no_better(off)}{lacks(off_model)}"
     return line + how_open(about["parts"], about["holes"], about["largest_hole_m"], bool(made.about.get("offline")))

@@ -78,7 +78,7 @@ def test_a_run_says_its_score_and_what_to_do_next(sequence, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert "ADD-S" in out and "object" in out
     results = f"Results in {tmp_path / 'out'}, first masks in {tmp_path / 'out/first_masks.png'}."
-    assert out.splitlines()[-1] == f"{results} Next: p2p eval {tmp_path / 'out'} --json"
+    assert out.splitlines()[-1] == f"{results} Next: p2p view {tmp_path / 'out'}"
     assert err == ""
 
 
@@ -1107,7 +1107,7 @@ def test_an_interruption_leaves_what_was_there(sequence, tmp_path, capsys, monke
     assert run(sequence, tmp_path / "out") == 130
     out, err = capsys.readouterr()
     first, then = err.rstrip().split(". Go on with it: ")
-    assert first == "p2p run: interrupted" and "p2p eval" in out
+    assert first == "p2p run: interrupted" and "p2p view" in out
     loaded = load_run(tmp_path / "out")
     assert loaded.objects["object"].frame_index.tolist() == list(range(5))
     assert len(loaded.timings["total_ms"]) == 5
