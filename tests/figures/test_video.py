@@ -11,7 +11,7 @@ import pytest
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.keypoint_log import KeypointLog
-from p2p_lib.figures import style
+from p2p_lib.figures import overlay, style
 from p2p_lib.figures.film import Film, write_film, write_video
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import save_video
@@ -149,6 +149,14 @@ def test_seconds_count_from_the_start(made):
     sequence.frame = lambda i: first
     images = Scene(sequence, replace(made.run, objects=later)).draw(0), Scene(made.sequence, made.run).draw(0)
     np.testing.assert_array_equal(*images)
+
+
+def test_the_caption_names_the_frame_as_reports_do(made, monkeypatch):
+    said = []
+    monkeypatch.setattr(overlay, "draw_labels", lambda image, labels, caption: said.append(caption) or image)
+    Scene(made.sequence, made.run).draw(3)
+    seconds = made.sequence.times_s[3] - made.sequence.times_s[0]
+    assert said == [f"{made.sequence.name}  frame 3  {seconds:.2f} s"]
 
 
 def test_images_of_an_offline_run_say_so_in_their_corner(made):
