@@ -31,7 +31,7 @@ from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera, sees
 from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size
-from p2p_lib.datasets.image_sequence import WRITE_K, paired_images, read_K
+from p2p_lib.datasets.image_sequence import paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
@@ -64,7 +64,6 @@ _KNOWN = "--size NAME=CM (the object's longest side)"
 _PUT = {
     "rgb": "Put the colour images there, one for each depth image.",
     "depth": "Put the depth images there, registered to colour, one for each colour image, in 16-bit millimetres.",
-    "K": WRITE_K,
 }
 _REPLACE = "Replace it, or leave out both of its images."
 
@@ -161,11 +160,10 @@ def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "", 
 
 
 def _once(faults: Iterable[tuple[P2PError, str]], looked_at: int) -> Iterator[Finding]:
-    """Errors of files, each with what to do otherwise; those that differ in names and numbers alone are one finding."""
+    """Errors of files, each with what to do otherwise; those that differ in numbers alone are one finding."""
     alike: dict[str, list[tuple[P2PError, str]]] = {}
     for error, otherwise in faults:
-        said = str(error).replace(getattr(error, "name", ""), "")
-        alike.setdefault(re.sub(r"\d+", "N", said), []).append((error, otherwise))
+        alike.setdefault(re.sub(r"\d+", "N", str(error)), []).append((error, otherwise))
     for (first, otherwise), *others in alike.values():
         names = [Path(getattr(error, "name", "")).name for error, _ in others]
         more = f"; {len(names)} more like it of the {looked_at} frames looked at: {_listed(names)}" if names else ""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 #: Frames that are looked at, evenly spread over the run.
 LOOKS = 60
-#: What the numbers are called, what they say, and which way is good.
+#: What the numbers are called, and what they say.
 HEADS = {
     "pose": ("pose [%]", ""),
     "doubted": ("doubted [%]", f"of confidence {DOUBTED:g} at most"),

@@ -111,8 +111,9 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     hull = collision(shape)
     with replacing(out / "collision.obj") as file:
         file.write(hull.export(file_type="obj", include_normals=False).encode())
-    off = errors(made, name, evenly(held_out, 12), textured, render, surface)
-    off_model = beside(made, name, evenly(held_out, 12), Renderer(shape.vertices, shape.faces, camera))
+    tried = evenly(held_out, 12)
+    off = errors(made, name, tried, textured, render, surface)
+    off_model = beside(made, name, tried, Renderer(shape.vertices, shape.faces, camera))
     about = _about(made, name, textured, len(views), off)
     about |= {"masks_beside": round(off_model, 4), "collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")

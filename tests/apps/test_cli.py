@@ -311,6 +311,7 @@ def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_pat
     assert "out/one: the run to go on with: got no --prompts, expected --prompts" in (line := one_line(capsys))
     assert "Nothing was run, and the table is as it was." in line and not (tmp_path / "out/failures").exists()
     assert (tmp_path / "out/batch.csv").read_bytes() == table
+    assert cli.main([*words, *clicks(tmp_path, ("object", 0, [[60, 50]])), "--stop", "2", "--skip-bad"]) == 0
 
 
 def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsys, monkeypatch):

@@ -66,6 +66,7 @@ def test_note_says_what_was_made_from_what(made, folders):
     assert evaluation["align"] == "first" and sequence["frames"] == len(made.sequence)
     assert set(sequence["sha256"]) == {"cam_K.txt", "scenario.json", "first frame"}
     assert {"p2p_lib", "python", "numpy", "matplotlib"} <= set(note["versions"]) and "commit" in note
+    assert "code" not in note, "of a quick profile"
     import hashlib
 
     assert note["sha256"]["plot.png"] == hashlib.sha256((folder / "figures" / "plot.png").read_bytes()).hexdigest()

@@ -121,7 +121,7 @@ def test_a_run_as_a_film_has_its_masks_keypoints_and_seconds(made, tmp_path):
     assert len(frames) == len(playback) and frames[0].shape == (120, 160, 3)
 
 
-def test_a_film_outlines_the_surfaces_at_their_poses_where_that_is_asked_for(made, tmp_path):
+def test_a_film_outlines_the_surfaces_at_their_poses_where_that_is_asked_for(made, tmp_path, monkeypatch):
     """A ball of 4 cm at each object's origin: white where its rim is seen, and the rest of the image as without."""
     import trimesh
 
@@ -139,6 +139,8 @@ def test_a_film_outlines_the_surfaces_at_their_poses_where_that_is_asked_for(mad
     assert len(changed) > 50 and away_px.max() < 5
     frames = [decoded(write_film(run, tmp_path / f"{of}.mp4", made.sequence, surfaces=of))[0] for of in (0, 1)]
     assert any((a != b).any() for a, b in zip(*frames))
+    monkeypatch.setattr(Playback, "of_kept_map", lambda self, name: np.zeros(len(self), bool))
+    assert playback.silhouettes(row) == {}, "of a pose in another map there is no surface"
 
 
 def test_seconds_count_from_the_start(made):

@@ -315,12 +315,18 @@ def test_exposure_is_evened_out():
 
 def test_a_texture_that_is_no_better_than_vertex_colours_is_told(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(model, "errors", lambda *of: {"texture": 16.34, "vertex_colours": 15.52, "frames": 12})
+    monkeypatch.setattr(model, "beside", lambda *of: 0.08)
     chosen = texture.chosen_rows  # of one row: all take their time
     monkeypatch.setattr(texture, "chosen_rows", lambda made, name, rows, of: chosen(made, name, rows[:1], of))
     told = write_product(finished, "model", tmp_path / "out", faces=100)
     assert "texture of 1 view," in told
     assert ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)" in told
+    assert ", 8 % of its masks lie beside it: it lacks a part" in told
     assert model.no_better({"texture": 9.0, "vertex_colours": 15.5}) == ""
+
+
+def grown(mask: np.ndarray, by_px: int) -> np.ndarray:
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) <= by_px
 
 
 def test_a_model_that_lacks_a_part_is_told(finished):
@@ -333,6 +339,12 @@ def test_a_model_that_lacks_a_part_is_told(finished):
         render = Renderer(vertices, whole.faces, made.sequence.camera)
         shares.append(model.beside(made, "box", np.arange(0, len(made.frames), 4), render))
     assert shares[0] == 0 and shares[0] < shares[1] < shares[2]
+    # A surface without its fringe lacks no part, and with masks of every fourth pixel one without a wider fringe.
+    for off_px, exact in ((4, True), (8, False)):
+        masks = {int(i): {"box": grown(made.masks(int(i))["box"], off_px)} for i in made.frames[::4]}
+        wide = SimpleNamespace(frames=made.frames, run=made.run, masks=masks.get, exact_masks=exact)
+        render = Renderer(whole.vertices, whole.faces, made.sequence.camera)
+        assert model.beside(wide, "box", np.arange(0, len(made.frames), 4), render) == 0
     assert model.lacks(shares[0]) == "" and "lacks a part" in model.lacks(shares[2])
 
 
