@@ -241,6 +241,44 @@ def test_what_was_found_by_its_colours_alone_is_left_for_where_its_points_are():
         assert iou(found, card(back)) > 0.9
 
 
+def test_what_was_seen_beside_the_object_is_not_taken_for_it_while_it_is_hidden():
+    """Where its motion leads stands something red: since before, or only now; or the card where it was."""
+    at, beside = (40, 90), (230, 95)
+    points = np.add([[8, 8], [50, 10], [30, 20], [12, 30], [45, 40], [25, 42], [52, 28], [18, 18]], at).astype(float)
+
+    def red(k: int, *where: tuple[int, int]) -> Frame:
+        frame = picture(k, [(corner, 1) for corner in where], card(at, (160, 120)) if at not in where else None)
+        for corner in where:
+            frame.rgb[card(corner)] = 200, 40, 30
+        return frame
+
+    def found(known: BuiltinSegmenter, *where: tuple[int, int]) -> np.ndarray:
+        centre = np.add(where[-1], [30, 25])[None]
+        place = CAMERA.unproject(centre, np.array([CARD_M + 0.05]))[0]
+        return known.segment(red(3, *where), hints={"card": Hint(place=np.append(place, 0.05))}) == 1
+
+    def shown(*others: Frame) -> BuiltinSegmenter:
+        """Shown with these beside it, which are hidden with it."""
+        known = segmenter()
+        known.segment(others[0], on(card=at))
+        known.segment(others[1], hints={"card": Hint(points, T_cam_obj=np.eye(4))})
+        return known
+
+    with_twin, alone = shown(red(0, at, beside), red(1, at, beside)), shown(red(0, at), red(1, at))
+    poster, hand = [red(k, at) for k in (0, 1)], [red(k, at, beside) for k in (0, 1)]
+    for frame in poster:
+        frame.rgb[card(beside)] = 200, 40, 30
+    for frame in hand:
+        frame.rgb[card(beside)] = 210, 160, 130
+    for known in (with_twin, alone, with_poster := shown(*poster), with_hand := shown(*hand)):
+        assert not (known.segment(red(2, *[beside] * (known is with_twin))) == 1).any(), "hidden"
+    assert not found(copy.deepcopy(with_twin), beside).any()
+    assert not found(copy.deepcopy(with_twin), (236, 95)).any(), "it has moved a little"
+    assert iou(found(with_twin, beside, at), card(at)) > 0.9, "that is its own place"
+    for known in (alone, with_poster, with_hand):
+        assert iou(found(known, beside), card(beside)) > 0.9, "nothing of its colours was there before"
+
+
 def test_what_comes_out_where_its_motion_leads_is_known_by_its_colours():
     """No point of it is found again, since it shows another side."""
     at, back, follow = (40, 90), (230, 95), segmenter()

@@ -211,7 +211,9 @@ class BuiltinSegmenter:
         if claim is None:  # too fast for the flow: look near its last place
             return target, find(view, target, near_last(view, target, hint), taken)
         if due and hint.T_cam_obj is not None:
-            target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj))
+            own = np.zeros(view.frame.shape, bool)
+            _mark(own, claim)
+            target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj, own))
         return target, claim
 
     def _refined(
