@@ -35,7 +35,7 @@ from p2p_lib.datasets.image_sequence import paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
-from p2p_lib.evaluation.known_size import size_doubt
+from p2p_lib.evaluation.known_size import Lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.evaluation.suspicions import doubt_growth
 from p2p_lib.method.sampling import choose, usable_region
@@ -241,14 +241,13 @@ def _camera(camera: Camera) -> Finding:
 
 def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Camera) -> Finding:
     """Whether what a mask holds is as long as the object is known to be."""
-    text = size_doubt(known_m, measured_m := mask_length_m(frame, mask, camera))
-    if text:
+    of = Lengths(known_m, measured_m := mask_length_m(frame, mask, camera))
+    if text := of.doubt:
         return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")
     if not np.isfinite(measured_m):
         text = f"{100 * known_m:g} cm given; its mask in frame {frame.index} has too little depth to be measured"
         return Finding(f"{name}: size", Level.OPTIONAL, text)
-    text = f"{100 * measured_m:.1f} cm by its mask in frame {frame.index}, {100 * known_m:g} cm given: fits"
-    return Finding(f"{name}: size", Level.OK, text)
+    return Finding(f"{name}: size", Level.OK, f"{of.fit} (frame {frame.index})")
 
 
 def _times(sequence: Sequence) -> Finding:

@@ -17,7 +17,7 @@ from pathlib import Path
 from shlex import quote
 from shutil import get_terminal_size
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from p2p_lib.apps.command_line import (
     JSON,
@@ -40,6 +40,9 @@ from p2p_lib.core.files import check_new
 from p2p_lib.core.options import RunOptions, differing, lengths_m, names, pairs
 from p2p_lib.core.progress import waiting_for
 from p2p_lib.offline import NOT_CAUSAL, PRODUCTS
+
+if TYPE_CHECKING:
+    from p2p_lib.evaluation.known_size import Lengths
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
@@ -109,6 +112,7 @@ def _run(a: argparse.Namespace) -> int:
     with waiting_for("Loading libraries", not a.quiet):
         from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
         from p2p_lib.datasets.runs import read_info
+        from p2p_lib.evaluation.known_size import lengths
         from p2p_lib.run import run
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
@@ -126,7 +130,8 @@ def _run(a: argparse.Namespace) -> int:
     options = replace(options, save_masks=options.save_masks or film is not None)
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
-    print("\n".join([*result.summary, *_that_fit(a.out, options.sizes), *_without_map(a.out)]))
+    known_m = lengths_m(options.sizes, options.sizes or ())
+    print("\n".join([*result.summary, *_that_fit(lengths(a.out, known_m)), *_without_map(a.out)]))
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
         print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
@@ -165,22 +170,9 @@ def _check_as_before(folder: Path, out: Path, options: RunOptions) -> None:
             raise BadInput(f"{out / one.key}: the run to go on with", now, f"{was}, as it began", fix)
 
 
-def _that_fit(run: Path, sizes: Mapping[str, Any] | None) -> list[str]:
+def _that_fit(measured: Mapping[str, Lengths]) -> list[str]:
     """A line for each object that was measured as long as it is known to be."""
-    if not sizes:
-        return []
-    from p2p_lib.datasets.mask_log import load_masks
-    from p2p_lib.evaluation.known_size import mesh_length_m, size_doubts
-    from p2p_lib.evaluation.suspicions import median_of_known
-
-    known_m, masks, lines = lengths_m(sizes, sizes), load_masks(run), []
-    doubts = size_doubts(run, known_m)
-    for name in (name for name in known_m if name not in doubts):
-        by_m = {"masks": median_of_known(masks[name].size_m)} if name in masks else {}
-        by_m["surface"] = mesh_length_m(run / "meshes" / f"{name}.ply")
-        if measured := [f"{100 * m:.1f} cm by its {what}" for what, m in by_m.items() if m == m]:
-            lines.append(f"{name}: {' and '.join(measured)}, {100 * known_m[name]:g} cm given: fits")
-    return lines
+    return [f"{name}: {of.fit}" for name, of in measured.items() if of.fit]
 
 
 def _without_map(run: Path) -> list[str]:
@@ -308,13 +300,14 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
-    from p2p_lib.evaluation.known_size import size_doubts
+    from p2p_lib.evaluation.known_size import lengths
     from p2p_lib.evaluation.protocol import evaluate
 
     run = load_run(a.run)
     score, not_scored = None, ""
     sizes = options.sizes or (run.info.get("options") or {}).get("sizes")
     known_m = lengths_m(sizes, run.objects)
+    measured = lengths(a.run, known_m)
     if any(obj.has_truth.any() for obj in run.objects.values()):
         try:
             score = evaluate(run, options.models, a.align, a.min_visible_px)
@@ -324,13 +317,14 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
             not_scored = _reason(str(error), a.run)
     elif given_models(options.models or {}, run.objects):
         warn("p2p eval: --models is not used, because the run has no truth.")
-    for name, text in size_doubts(a.run, known_m).items() if score else ():
-        warn(f"p2p eval: {name}: {text}")
+    for name, of in measured.items():
+        if score and of.doubt:
+            warn(f"p2p eval: {name}: {of.doubt}")
     rest = run.objects if score is None else {n: obj for n, obj in run.objects.items() if not obj.has_truth.any()}
     judged = replace(consistency(replace(run, objects=rest), known_m=known_m), not_scored=not_scored) if rest else None
     said = [of for of in (score, judged) if of is not None]
     _show(said[0], a.json, bool(run.info.get("offline")), *said[1:])
-    print("".join(f"{line}\n" for line in _that_fit(a.run, sizes) if not a.json), end="")
+    print("".join(f"{line}\n" for line in _that_fit(measured) if not a.json), end="")
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")

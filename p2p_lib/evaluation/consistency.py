@@ -24,7 +24,7 @@ from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.evidence import ON_M, drawn_m, gathered, on_surface, reprojected, surface_in_view
-from p2p_lib.evaluation.known_size import size_doubts
+from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, median_of_known, suspicions
 
@@ -92,12 +92,14 @@ class Consistency:
     def as_table(self) -> str:
         """The same for people, with what each number says."""
         said = {key for numbers in self.objects.values() for key, value in numbers.items() if np.isfinite(value)}
-        legend = ["; ".join(f"{head}: {says}" for key, (head, says) in HEADS.items() if key in said and says)]
+        legend = "; ".join(f"{head}: {says}" for key, (head, says) in HEADS.items() if key in said and says)
         hz = [f"{self.hz:.1f} Hz"] if self.hz is not None else []
         ran = ", ".join(f"{key} {value}" for key, value in ran_with(self.info).items())
         without = f"Not scored: {self.not_scored}.\nWithout a model" if self.not_scored else "Without truth"
         title = f"{without}: how well the run agrees with what the camera saw (- where nothing was kept to tell)"
-        return "\n".join([title, tables.as_text(self.as_frame()), *self.look_at(), *legend, SCALE, *hz, ran])
+        return "\n".join(
+            [title, tables.as_text(self.as_frame()), *self.look_at(), *filter(None, [legend]), SCALE, *hz, ran]
+        )
 
     def verdict(self, name: str) -> str:
         """In a word: ``good``, ``look`` at the film before an object's poses are believed, or ``unknown``."""
@@ -126,7 +128,7 @@ def consistency(
     except P2PError as error:
         no_images = str(error)
     keypoints, masks, every = load_keypoints(run.path), load_masks(run.path), load_run(run.path, every_map=True)
-    sizes = size_doubts(run.path, known_m or {})
+    sizes = {name: of.doubt for name, of in lengths(run.path, known_m or {}).items() if of.doubt}
     objects, found, unknown = {}, {}, {}
     for name, whole in run.objects.items():
         rows = whole.followed if whole.followed.any() else np.ones(len(whole), bool)

@@ -6,6 +6,7 @@ Both agree with themselves: everything is longer or shorter by one factor, poses
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,34 +23,55 @@ _POINTS, _SHREDS = 4000, 0.01
 _OFTEN = 0.9
 
 
-def size_doubt(known_m: float, mask_m: float, mesh_m: float = float("nan")) -> str:
-    """What speaks against a known length, in words; "" where nothing does. NaN: not measured.
+@dataclass(frozen=True)
+class Lengths:
+    """One object's length, m, as known and as measured; NaN: not measured.
 
     mask_m  the length of what masks hold, where they show the most of it
     mesh_m  the longest side of the reconstructed surface
     """
-    measured = {"in its masks": mask_m, "of its surface": mesh_m}
-    measured = {what: m for what, m in measured.items() if np.isfinite(m)}
-    off = {
-        what: m / known_m for what, m in measured.items() if not SHORTER * known_m <= m <= LONGER * known_m + SLACK_M
-    }
-    if not off or (len(off) < len(measured) and min(off.values()) < 1):  # the other has seen all of it
-        return ""
-    found = " and ".join(f"{100 * m:.1f} cm {what}" for what, m in measured.items())
-    factor = float(np.median(list(off.values())))
-    text = f"known to be {100 * known_m:.1f} cm long, measured {found}, {factor:.2f} times"
-    besides = "its length was never in view" if factor < 1 else "masks hold more than the object"
-    return f"{text}: focal length or depth scale is wrong by this factor, or {besides}"
+
+    known_m: float
+    mask_m: float
+    mesh_m: float = float("nan")
+
+    @property
+    def doubt(self) -> str:
+        """What speaks against the known length, in words; "" where nothing does."""
+        least_m, most_m = SHORTER * self.known_m, LONGER * self.known_m + SLACK_M
+        off = [m / self.known_m for m in self._measured.values() if not least_m <= m <= most_m]
+        if not off or (len(off) < len(self._measured) and min(off) < 1):  # the other has seen all of it
+            return ""
+        factor = float(np.median(off))
+        text = f"known to be {100 * self.known_m:.1f} cm long, measured {self._found}, {factor:.2f} times"
+        besides = "its length was never in view" if factor < 1 else "masks hold more than the object"
+        return f"{text}: focal length or depth scale is wrong by this factor, or {besides}"
+
+    @property
+    def fit(self) -> str:
+        """That it is measured as long as it is known to be, in words; "" where it is not, or not measured."""
+        if self.doubt or not self._measured:
+            return ""
+        return f"measured {self._found}, {100 * self.known_m:g} cm given: fits"
+
+    @property
+    def _measured(self) -> dict[str, float]:
+        each = {"in its masks": self.mask_m, "of its surface": self.mesh_m}
+        return {what: m for what, m in each.items() if np.isfinite(m)}
+
+    @property
+    def _found(self) -> str:
+        return " and ".join(f"{100 * m:.1f} cm {what}" for what, m in self._measured.items())
 
 
-def size_doubts(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, str]:
-    """Object to what speaks against its known length in a run's folder, for those of which something does."""
+def lengths(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, Lengths]:
+    """Objects of known length, m, as a run's folder has measured them."""
     masks, found = load_masks(folder) if known_m else {}, {}
     for name, length_m in known_m.items():
         sizes = masks[name].size_m[np.isfinite(masks[name].size_m)] if name in masks else np.zeros(0)
         mask_m = float(np.quantile(sizes, _OFTEN)) if len(sizes) else float("nan")
-        found[name] = size_doubt(length_m, mask_m, mesh_length_m(Path(folder) / "meshes" / f"{name}.ply"))
-    return {name: text for name, text in found.items() if text}
+        found[name] = Lengths(length_m, mask_m, mesh_length_m(Path(folder) / "meshes" / f"{name}.ply"))
+    return found
 
 
 def mesh_length_m(path: Path) -> float:

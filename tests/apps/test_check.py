@@ -387,7 +387,7 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     known = {"sizes": {"box": 100 * length_m}}
     assert found(good, "box: size", **known).level is Level.OK
     shorter = found(good, "box: size", sizes={"box": 90 * length_m})
-    said = f"{100 * length_m:.1f} cm by its mask in frame 0, {90 * length_m:g} cm given: fits"
+    said = f"measured {100 * length_m:.1f} cm in its masks, {90 * length_m:g} cm given: fits (frame 0)"
     assert (shorter.level, shorter.text) == (Level.OK, said)
     bare = replace(frame, depth_m=np.zeros_like(frame.depth_m))
     assert check._size("box", length_m, bare, bare.depth_m == 0, CAMERA).level is Level.OPTIONAL, "not measured"

@@ -515,7 +515,7 @@ def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(seque
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):
     """The board is 60 px wide half a metre away: 15 cm."""
     run(sequence, tmp_path / "run", "--size", "object=15")
-    fits = re.compile(r"^object: 1\d\.\d cm by its masks, 15 cm given: fits$", re.MULTILINE)
+    fits = re.compile(r"^object: measured 1\d\.\d cm in its masks, 15 cm given: fits$", re.MULTILINE)
     assert "known to be" not in (out := capsys.readouterr().out) and fits.search(out)
     run(sequence, tmp_path / "other", "--size", "object=7")
     assert re.search(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from p2p_lib.evaluation.known_size import mesh_length_m, size_doubt
+from p2p_lib.evaluation.known_size import Lengths, mesh_length_m
 
 NAN = float("nan")
 
@@ -25,8 +25,9 @@ NAN = float("nan")
 def test_what_does_not_fit_is_said(mask_m, mesh_m, said):
     import re
 
-    text = size_doubt(0.10, mask_m, mesh_m)
-    assert re.search(said, text) if said else not text
+    lengths = Lengths(0.10, mask_m, mesh_m)
+    assert re.search(said, lengths.doubt) if said else not lengths.doubt
+    assert bool(lengths.fit) == (not said and mask_m > 0), "measured, and fits"
 
 
 def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies_and_whatever_sticks_out(tmp_path):
