@@ -87,7 +87,7 @@ def test_a_part_that_moves_along_is_told_from_a_neighbour_that_stays():
 def test_of_its_past_the_first_frame_and_six_recent_ones_are_kept():
     past = Past()
     for k in range(12):
-        past = past.with_frame(scene(5 * k, 0.0), left(0.01 * k), at(PLATE))
+        past = past.with_frame(scene(5 * k, 0.0), left(0.01 * k))
     assert [then.index for then, _ in past.seen] == [0, 30, 35, 40, 45, 50, 55]
 
 
@@ -209,7 +209,7 @@ def test_the_first_frame_is_remembered_and_the_newest():
     past, seen = Past(), range(0, 60)
     for k in seen:
         if past.due(scene_of_nothing(k)):
-            past = past.with_frame(scene_of_nothing(k), left(0.01 * k), np.zeros((2, 2), bool))
+            past = past.with_frame(scene_of_nothing(k), left(0.01 * k))
     kept = [frame.index for frame, _ in past.seen]
     assert kept[0] == 0 and kept[-1] == 55 and len(kept) < 10 and min(np.diff(kept)) >= 5
     motions = past.motions(scene_of_nothing(60), left(0.6))

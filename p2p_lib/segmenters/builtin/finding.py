@@ -9,7 +9,6 @@ import numpy as np
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
-from p2p_lib.segmenters.builtin.colours import evidence, histogram
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
@@ -27,8 +26,8 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 
 #: The expected object has at least this many pixels, with mean log-odds of colour (nats) of at least this.
 _MIN_COMPONENT_PX, _MIN_LIKELIER = 80, 1.0
-#: If something alike was at more than this share of its pixels while the object was beside it, it is something else.
-_OTHERS = 0.25
+#: What something else takes up by more than this share is not the object.
+_BESIDE = 0.25
 #: An object may move this far from one frame to the next, m.
 _LEAP_M = 0.15
 
@@ -81,8 +80,7 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     near = measured & (patch.squared_distances_m2(centre_m) < within_m**2)
     if np.count_nonzero(near) < _MIN_COMPONENT_PX:
         return NO_PX
-    log_odds = evidence(target.colours, histogram(patch.codes[measured & ~near]))
-    colour = view.config.colour_weight * log_odds[patch.codes]
+    colour = by_colour(patch, target.colours, measured & ~near, view.config)
     plane, free = support_plane(patch, measured), patch.smooth
     if plane is not None:
         free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
@@ -91,9 +89,9 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     component = np.where(like, connected_components(dilated(like, 1)), 0)
     size = np.bincount(component.ravel())
     likelier = np.bincount(component.ravel(), colour.ravel()) / np.maximum(size, 1)
-    others = np.bincount(component.ravel(), target.past.others(patch, log_odds > 0).ravel()) / np.maximum(size, 1)
     size[(likelier < _MIN_LIKELIER) | (size < _MIN_COMPONENT_PX)], size[0] = 0, 0
-    size[others > _OTHERS] = 0
+    if target.bystanders is not None:
+        size[target.bystanders.shares(patch, component) > _BESIDE] = 0
     if not size.any():
         return NO_PX
     v, u = np.nonzero(component == size.argmax())

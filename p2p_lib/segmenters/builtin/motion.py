@@ -41,13 +41,9 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some recent ones.
-
-    own  (H, W) bool: its mask in the newest of them
-    """
+    """Frames that an object was seen in, with its poses T_cam_obj (4, 4): the first, and some recent ones."""
 
     seen: tuple[tuple[Frame, np.ndarray], ...] = ()
-    own: np.ndarray | None = None
 
     @property
     def full(self) -> bool:
@@ -58,20 +54,9 @@ class Past:
         """Whether a frame is to be remembered."""
         return not self.seen or frame.index >= self.seen[-1][0].index + EVERY
 
-    def with_frame(self, frame: Frame, T_cam_obj: np.ndarray, own: np.ndarray) -> Past:
+    def with_frame(self, frame: Frame, T_cam_obj: np.ndarray) -> Past:
         """With one more frame; beyond the limit the oldest but the first is dropped."""
-        return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)), own)
-
-    def others(self, patch: Patch, likelier: np.ndarray) -> np.ndarray:
-        """(h, w) bool: where something else of its colours was, beside it, at the depth of now.
-
-        likelier  (4096,) bool: the colours that are likelier the object's
-        """
-        if self.own is None:
-            return np.zeros(patch.shape, bool)
-        then = Patch.like(self.seen[-1][0], patch.box, patch.cell_px, patch.camera)
-        beside = patch.down(self.own.astype(np.float32)) < 0.5
-        return beside & likelier[then.codes] & (np.abs(patch.depth_m - then.depth_m) < 2 * then.step_m)
+        return Past((*self.seen[:1], *self.seen[1:][1 - _KEPT :], (frame, T_cam_obj)))
 
     def motions(self, now: Frame, T_cam_obj: np.ndarray) -> Motions | None:
         """The motions since one of the recent frames, taken in turns, and since the first; None without frames."""

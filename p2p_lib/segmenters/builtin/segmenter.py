@@ -22,6 +22,7 @@ from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
+from p2p_lib.segmenters.builtin.bystanders import with_bystanders
 from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
@@ -194,6 +195,9 @@ class BuiltinSegmenter:
         hint = hints.get(name, _NO_HINT)
         agreed = hint.T_cam_obj is not None and len(hint.uv_px) >= view.config.find_points
         held, target = target.confident, replace(target, confident=agreed)
+        if target.bystanders is not None:
+            beside = None if hint.place is None else target.bystanders.followed(view.frame)
+            target = replace(target, bystanders=beside)
         if hint.gone:
             return target, None
         if predicted is None or hint.sighted:  # a sighting overrules the mask that was followed
@@ -211,9 +215,7 @@ class BuiltinSegmenter:
         if claim is None:  # too fast for the flow: look near its last place
             return target, find(view, target, near_last(view, target, hint), taken)
         if due and hint.T_cam_obj is not None:
-            own = np.zeros(view.frame.shape, bool)
-            _mark(own, claim)
-            target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj, own))
+            target = replace(target, past=target.past.with_frame(view.frame, hint.T_cam_obj))
         return target, claim
 
     def _refined(
@@ -250,16 +252,18 @@ class BuiltinSegmenter:
                 wins = x > np.maximum(likeliest, 0.5)
                 part[wins], likeliest[wins] = label, x[wins]
         for label, (name, target) in enumerate(self._targets.items(), 1):
-            if (claim := claims.get(name)) is None:
-                self._targets[name] = replace(target, seen=None) if name in claims else target
+            if name not in claims:
                 continue
-            box, _ = claim
-            part = labels[box.slices]
-            mask = part == label
-            seen = seen_in(frame, mask, box, cfg.min_px, None if target.seen is None else target.seen.z_m)
+            seen = None
+            if (claim := claims[name]) is not None:
+                box, _ = claim
+                part = labels[box.slices]
+                mask = part == label
+                seen = seen_in(frame, mask, box, cfg.min_px, None if target.seen is None else target.seen.z_m)
+                if seen is None:
+                    part[mask] = 0
+            target = target if seen is not None else with_bystanders(view, target)
             self._targets[name] = target.with_seen(frame, seen, view.focal_px, cfg)
-            if seen is None:
-                part[mask] = 0
         return labels
 
     def _doubt_prompts(self, labels: np.ndarray, cutters: Mapping[str, Cutter], new: Collection[str]) -> None:

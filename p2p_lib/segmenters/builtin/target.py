@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import colour_codes, histogram
 from p2p_lib.segmenters.builtin.motion import Past
 from p2p_lib.segmenters.builtin.patch import Box, approximate_median
+
+if TYPE_CHECKING:
+    from p2p_lib.segmenters.builtin.bystanders import Bystanders
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,7 @@ class Target:
     past       frames that it was seen in, with its poses
     confident  whether enough points agreed on its pose when it was cut out last
     proven     whether its points were ever on it since it was found; found by colours alone it may be something else
+    bystanders what was beside it when it vanished; None while it is seen, and where nobody expects it
     given      the newest frame with a mask that was given and not empty. It is learnt from only when needed, which it
                never is where every frame brings a mask
     """
@@ -50,6 +55,7 @@ class Target:
     past: Past = field(default_factory=Past)
     confident: bool = False
     proven: bool = True
+    bystanders: Bystanders | None = None
     given: tuple[Frame, np.ndarray] | None = None
 
     @property
@@ -81,7 +87,7 @@ class Target:
             return replace(self, seen=seen, colours=colours, size_m=size_m)
         rate = config.colour_rate
         colours = (1 - rate) * self.colours + rate * colours
-        return replace(self, seen=seen, colours=colours, size_m=np.maximum(size_m, self.size_m))
+        return replace(self, seen=seen, bystanders=None, colours=colours, size_m=np.maximum(size_m, self.size_m))
 
 
 def seen_in(frame: Frame, mask: np.ndarray, box: Box, min_px: int, z_m: float | None = None) -> Seen | None:
