@@ -259,11 +259,13 @@ def interrupt():
         time.sleep(0.01)
     os.kill(os.getpid(), signal.SIGINT)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
 out = Path(sys.argv[1])
 outcomes = execute([SimpleNamespace(key="a")], out, 1, None, hold)
 threading.Thread(target=interrupt).start()
 try:
     next(outcomes)
+    sys.exit("it was not interrupted")
 except KeyboardInterrupt:
     outcomes.close()
 """
