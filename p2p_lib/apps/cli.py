@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import partial
@@ -17,7 +17,7 @@ from pathlib import Path
 from shlex import quote
 from shutil import get_terminal_size
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from p2p_lib.apps.command_line import (
     JSON,
@@ -40,9 +40,6 @@ from p2p_lib.core.files import check_new
 from p2p_lib.core.options import RunOptions, differing, lengths_m, names, pairs
 from p2p_lib.core.progress import waiting_for
 from p2p_lib.offline import NOT_CAUSAL, PRODUCTS
-
-if TYPE_CHECKING:
-    from p2p_lib.evaluation.known_size import Lengths
 
 #: Options that choose the method and its parameters.
 METHOD = ("preset", "config_file", "settings", "seed", "device", "tracker", "detector")
@@ -112,7 +109,7 @@ def _run(a: argparse.Namespace) -> int:
     with waiting_for("Loading libraries", not a.quiet):
         from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
         from p2p_lib.datasets.runs import read_info
-        from p2p_lib.evaluation.known_size import lengths
+        from p2p_lib.evaluation.known_size import lengths, that_fit
         from p2p_lib.run import run
     if a.batch is not None:
         from p2p_lib.benchmark.batch import TABLE, run_batch
@@ -131,7 +128,7 @@ def _run(a: argparse.Namespace) -> int:
     how = {"if_exists": a.if_exists or "refuse", "redo_from": a.redo_from, "progress": not a.quiet, "say": warn}
     result = run(a.sequence, a.out, options, **how)
     known_m = lengths_m(options.sizes, options.sizes or ())
-    print("\n".join([*result.summary, *_that_fit(lengths(a.out, known_m)), *_without_map(a.out)]))
+    print("\n".join([*result.summary, *that_fit(lengths(a.out, known_m)), *_without_map(a.out)]))
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
         print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
@@ -168,11 +165,6 @@ def _check_as_before(folder: Path, out: Path, options: RunOptions) -> None:
         if info["frames"] and now:
             fix = "Ask for the same, or name another --out. Nothing was run, and the table is as it was."
             raise BadInput(f"{out / one.key}: the run to go on with", now, f"{was}, as it began", fix)
-
-
-def _that_fit(measured: Mapping[str, Lengths]) -> list[str]:
-    """A line for each object that was measured as long as it is known to be."""
-    return [f"{name}: {of.fit}" for name, of in measured.items() if of.fit]
 
 
 def _without_map(run: Path) -> list[str]:
@@ -300,7 +292,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.evaluation.consistency import consistency
-    from p2p_lib.evaluation.known_size import lengths
+    from p2p_lib.evaluation.known_size import lengths, that_fit
     from p2p_lib.evaluation.protocol import evaluate
 
     run = load_run(a.run)
@@ -324,7 +316,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     judged = replace(consistency(replace(run, objects=rest), known_m=known_m), not_scored=not_scored) if rest else None
     said = [of for of in (score, judged) if of is not None]
     _show(said[0], a.json, bool(run.info.get("offline")), *said[1:])
-    print("".join(f"{line}\n" for line in _that_fit(measured) if not a.json), end="")
+    print("".join(f"{line}\n" for line in that_fit(measured) if not a.json), end="")
     if not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")

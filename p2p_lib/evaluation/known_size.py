@@ -74,6 +74,11 @@ def lengths(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, Lengt
     return found
 
 
+def that_fit(measured: Mapping[str, Lengths]) -> list[str]:
+    """A line for each object that was measured as long as it is known to be."""
+    return [f"{name}: {of.fit}" for name, of in measured.items() if of.fit]
+
+
 def mesh_length_m(path: Path) -> float:
     """The longest side of a box around a surface without its shreds; NaN where there is none."""
     if not path.is_file():

@@ -535,6 +535,10 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
         assert "size: got the name 'mug', expected one of the objects: object" in capsys.readouterr().err
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=long"]) == 2
     assert "its longest side in centimetres" in capsys.readouterr().err
+    shutil.rmtree(sequence / "annotated_poses")
+    run(sequence, tmp_path / "bare", "--size", "object=7")
+    assert capsys.readouterr() and cli.main(["eval", str(tmp_path / "bare")]) == 0
+    assert (said := capsys.readouterr()).out.count("known to be") == 1 and "known to be" not in said.err, "said once"
 
 
 def test_a_surface_that_is_exactly_flat_is_measured_and_drawn(pristine, tmp_path, capsys):

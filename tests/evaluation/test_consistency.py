@@ -12,7 +12,7 @@ from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog, load_masks
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
 from p2p_lib.datasets.runs import COLUMNS, NOT_FOLLOWED, load_run
-from p2p_lib.evaluation.consistency import HEADS, consistency
+from p2p_lib.evaluation.consistency import HEADS, Consistency, consistency
 from p2p_lib.evaluation.evidence import on_surface
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -150,6 +150,11 @@ def test_what_cannot_be_said_is_not(made, run, tmp_path):
     for key, (_, says) in HEADS.items():
         assert says in consistency(run, made.sequence).as_table()
         assert not says or (says in said.as_table()) == (key == "doubted"), "of what has a number alone"
+
+
+def test_a_table_of_numbers_that_need_no_words_has_no_empty_line():
+    numbers = dict.fromkeys(HEADS, float("nan")) | {"pose": 0.0}
+    assert "" not in Consistency({"box": numbers}, {"box": ()}).as_table().splitlines()
 
 
 def test_far_depth_is_as_near_to_the_surface_as_a_camera_measures_it():

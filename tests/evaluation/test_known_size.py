@@ -1,9 +1,12 @@
 """Known sizes: what does not fit is said, what may not have been in view is not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
 
+from p2p_lib.evaluation import known_size
 from p2p_lib.evaluation.known_size import Lengths, mesh_length_m
 
 NAN = float("nan")
@@ -28,6 +31,17 @@ def test_what_does_not_fit_is_said(mask_m, mesh_m, said):
     lengths = Lengths(0.10, mask_m, mesh_m)
     assert re.search(said, lengths.doubt) if said else not lengths.doubt
     assert bool(lengths.fit) == (not said and mask_m > 0), "measured, and fits"
+
+
+def test_a_run_is_measured_where_its_masks_show_the_most(tmp_path, monkeypatch):
+    """In a quarter of the frames all of it is in view; one mask is twice as long, one without depth."""
+    sizes = np.array([0.05] * 14 + [0.10] * 5 + [0.20] + [NAN])
+    monkeypatch.setattr(known_size, "load_masks", lambda folder: {"box": SimpleNamespace(size_m=sizes)})
+    found = known_size.lengths(tmp_path, {"box": 0.1, "other": 0.1})
+    assert found["box"].mask_m == pytest.approx(0.1) and np.isnan(found["other"].mask_m)
+    assert known_size.that_fit(found | {"long": Lengths(0.1, 0.3)}) == [
+        "box: measured 10.0 cm in its masks, 10 cm given: fits"
+    ]
 
 
 def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies_and_whatever_sticks_out(tmp_path):

@@ -81,9 +81,8 @@ def test_a_table_of_its_colours_is_none_and_what_stands_on_it_may_come_out():
     assert share(known.followed(scene(1, True)), np.s_[104:130, 204:246]) == 0
 
 
-def test_the_part_that_others_take_up():
+def test_which_parts_they_are():
     known = beside(picture(own=(OWN, 0.7), other=(BESIDE, 0.7)))
     patch, part = known.patch, np.zeros(known.there.shape, int)
     part[20:35, 10:22], part[20:35, 50:68] = 1, 2
-    shares = known.shares(patch, part)
-    assert shares[1] == 0 and 0.5 < shares[2] < 1
+    assert known.are(patch, part).tolist() == [False, False, True]

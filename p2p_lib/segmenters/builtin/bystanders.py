@@ -12,14 +12,14 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.colours import evidence, histogram
-from p2p_lib.segmenters.builtin.cut import max_plane_height_m
-from p2p_lib.segmenters.builtin.patch import Box, Patch, connected_components, plane_heights, support_plane
+from p2p_lib.segmenters.builtin.cut import standing_out
+from p2p_lib.segmenters.builtin.patch import Box, Patch, connected_components
 from p2p_lib.segmenters.builtin.target import Seen, Target
 from p2p_lib.segmenters.builtin.view import View
 
 #: Side of a cell of the grid, px.
 _CELL_PX = 4
-#: A part is what it was if this share of it was there a frame ago, as far away; or the object's, if it was there.
+#: A part is what it was if more than this share of it was there a frame ago, as far away; or the object, if that was.
 _SAME = 0.25
 
 
@@ -44,26 +44,27 @@ class Bystanders:
         own = patch.down(mask) > 0
         likelier = evidence(colours, histogram(patch.codes[~own])) > 0
         part = _parts(patch, likelier)
-        return cls(patch, likelier, (part > 0) & ~_of(part, own))
+        return cls(patch, likelier, (part > 0) & ~_in(part, own)[part])
 
     def followed(self, frame: Frame) -> Bystanders:
         """In the next frame."""
         patch = _whole(frame, self.patch.camera)
         part = _parts(patch, self.likelier)
         stayed = self.there & (np.abs(patch.depth_m - self.patch.depth_m) < 2 * patch.step_m)
-        return Bystanders(patch, self.likelier, (part > 0) & _of(part, stayed))
+        return Bystanders(patch, self.likelier, (part > 0) & _in(part, stayed)[part])
 
-    def shares(self, patch: Patch, part: np.ndarray) -> np.ndarray:
-        """(K,) the share of each part, by (h, w) int numbers on a patch of the newest frame, that they take up."""
+    def are(self, patch: Patch, part: np.ndarray) -> np.ndarray:
+        """(K,) bool: which parts, by (h, w) int numbers on a patch of the newest frame, they are."""
         image = np.zeros((patch.camera.height, patch.camera.width), np.float32)
         image[self.patch.box.slices] = self.patch.up(self.there)
-        return _share(part, patch.down(image) > 0.5)
+        return _in(part, patch.down(image) > 0.5)
 
 
 def with_bystanders(view: View, target: Target) -> Target:
     """A target that was seen a frame ago, and vanishes in this one."""
-    if target.seen is None or target.colours is None or view.previous is None:
+    if target.seen is None:
         return target
+    assert target.colours is not None and view.previous is not None  # a frame ago
     return replace(target, bystanders=Bystanders.beside(target.seen, target.colours, view.previous, view.camera))
 
 
@@ -75,17 +76,9 @@ def _whole(frame: Frame, camera: Camera) -> Patch:
 
 def _parts(patch: Patch, likelier: np.ndarray) -> np.ndarray:
     """(h, w) int: the parts in these colours that stand out from what everything stands on; 0 elsewhere."""
-    free, plane = patch.smooth, support_plane(patch, patch.depth_m > 0)
-    if plane is not None:
-        free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
-    return connected_components(likelier[patch.codes] & free)
+    return connected_components(likelier[patch.codes] & standing_out(patch, patch.depth_m > 0))
 
 
-def _share(part: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """(K,) the share of each part that is ``of`` (h, w) bool."""
-    return np.bincount(part.ravel(), of.ravel()) / np.maximum(np.bincount(part.ravel()), 1)
-
-
-def _of(part: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """(h, w) bool: the parts of which a share lies in a region (h, w) bool."""
-    return (_share(part, region) > _SAME)[part]
+def _in(part: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """(K,) bool: the parts (h, w) int of which a share lies in a region (h, w) bool."""
+    return np.bincount(part.ravel(), region.ravel()) > _SAME * np.maximum(np.bincount(part.ravel()), 1)

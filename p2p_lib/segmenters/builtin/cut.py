@@ -23,6 +23,7 @@ from p2p_lib.segmenters.builtin.patch import (
     connected_components,
     dilated,
     plane_heights,
+    support_plane,
 )
 
 #: Weight of a pixel's evidence at certainty; a tie to a neighbour that is alike weighs 1.
@@ -50,6 +51,14 @@ _NOTHING: Any = None
 def max_plane_height_m(sigma_m: np.ndarray | float) -> np.ndarray | float:
     """Height below which a pixel measured with this noise counts as plane."""
     return (_STANDS_OUT + 0.5) * sigma_m + _PLANE_SLACK_M
+
+
+def standing_out(patch: Patch, where: np.ndarray) -> np.ndarray:
+    """(h, w) bool: smooth cells above the plane that those ``where`` (h, w) bool stand on; all smooth ones without."""
+    plane = support_plane(patch, where)
+    if plane is None:
+        return patch.smooth
+    return patch.smooth & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
 
 
 def by_geometry(

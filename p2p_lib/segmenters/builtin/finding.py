@@ -9,7 +9,7 @@ import numpy as np
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, max_plane_height_m
+from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, standing_out
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
     around,
@@ -17,7 +17,6 @@ from p2p_lib.segmenters.builtin.patch import (
     connected_components,
     dilated,
     keep_seeded_components,
-    plane_heights,
     support_plane,
 )
 from p2p_lib.segmenters.builtin.prompted import NO_PX, ROOM_PX
@@ -26,8 +25,6 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 
 #: The expected object has at least this many pixels, with mean log-odds of colour (nats) of at least this.
 _MIN_COMPONENT_PX, _MIN_LIKELIER = 80, 1.0
-#: What something else takes up by more than this share is not the object.
-_BESIDE = 0.25
 #: An object may move this far from one frame to the next, m.
 _LEAP_M = 0.15
 
@@ -81,9 +78,7 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     if np.count_nonzero(near) < _MIN_COMPONENT_PX:
         return NO_PX
     colour = by_colour(patch, target.colours, measured & ~near, view.config)
-    plane, free = support_plane(patch, measured), patch.smooth
-    if plane is not None:
-        free = free & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
+    free = standing_out(patch, measured)
     # What depth connects with another object belongs to that one, even outside its mask.
     like = near & (colour > 0) & free & ~components_touching(connected_components(free), taken[patch.box.slices])
     component = np.where(like, connected_components(dilated(like, 1)), 0)
@@ -91,7 +86,7 @@ def _coloured_px(view: View, target: Target, place: np.ndarray, taken: np.ndarra
     likelier = np.bincount(component.ravel(), colour.ravel()) / np.maximum(size, 1)
     size[(likelier < _MIN_LIKELIER) | (size < _MIN_COMPONENT_PX)], size[0] = 0, 0
     if target.bystanders is not None:
-        size[target.bystanders.shares(patch, component) > _BESIDE] = 0
+        size[target.bystanders.are(patch, component)] = 0
     if not size.any():
         return NO_PX
     v, u = np.nonzero(component == size.argmax())
