@@ -75,6 +75,7 @@ def typed_options(parser: argparse.ArgumentParser) -> None:
 SEQUENCE = arg(
     "sequence", metavar="SEQ", help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA"
 )
+RUN = arg("run", type=Path, metavar="DIR", help="folder written by p2p run")
 JSON = arg("--json", action="store_true", help="JSON instead of a table")
 QUIET = arg("--quiet", action="store_true", help="no progress bar, and no word on what is waited for")
 NO_BROWSER = arg("--no-browser", action="store_true", help="only say where the page is")
@@ -260,6 +261,11 @@ def again(info: Mapping[str, Any], out: Path, **changes: Any) -> str:
     asked = as_it_began(info, **changes)
     place = info["path"] or info["sequence"]
     return " ".join(["p2p run", quote(place), "--out", quote(str(out)), *asked.words()])
+
+
+def unscored(not_scored: str, folder: Path) -> str:
+    """Why a run is not scored, behind words that say already which run, and that it is not."""
+    return not_scored.removeprefix(f"{folder}: nothing to score: ")
 
 
 def warn(line: object) -> None:
