@@ -21,7 +21,7 @@ import numpy as np
 from p2p_lib.apps.click import FirstMasks, check_depths, clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config, preset
+from p2p_lib.core.config import Config, DepthConfig, preset
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, did_you_mean
 from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.options import lengths_m
@@ -44,6 +44,8 @@ from p2p_lib.method.sampling import choose, usable_region
 FRAMES = 12
 #: Ranges in metres of whatever is recorded in front of a depth camera.
 NEAREST_M, FARTHEST_M = 0.05, 20.0
+#: Where less of what was measured than this share is at distances that count, the unit may be another.
+_USED_SHARE = 0.3
 #: Frames per second that cameras have, and a gap as a multiple of the usual interval.
 RATES_HZ, GAP = (0.5, 500.0), 10.0
 #: Fraction of images that may equal the next one.
@@ -120,7 +122,7 @@ def check_folder(
     sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects)
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
-    depth = _depth(frames, scale)
+    depth = _depth(frames, scale, None if firsts else config.depth)  # of objects it is told apart
     findings = [*wrong, Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
     pairs = [(f, after) for f in frames if (after := _readable(sequence, f.index + 1)) is not None]
     findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames)]
@@ -303,8 +305,8 @@ def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:
     return Finding("motion", Level.OK, "every image looked at differs from the next")
 
 
-def _depth(frames: list[Frame], scale: float) -> Finding:
-    """Whether depth is in metres once the scale is applied."""
+def _depth(frames: list[Frame], scale: float, counts: DepthConfig | None) -> Finding:
+    """Whether depth is in metres once the scale is applied, and at distances that count, where it is asked."""
     known = [frame.depth_m[frame.depth_m > 0] for frame in frames]
     share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
     if not share:
@@ -321,6 +323,12 @@ def _depth(frames: list[Frame], scale: float) -> Finding:
         fix = "Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1)."
         fix += f" {guess}." if (guess := likely_units(median_m, scale)) else ""
         return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
+    used = 1.0 if counts is None else float(((every_m >= counts.min_m) & (every_m <= counts.max_m)).mean())
+    if counts is not None and used < _USED_SHARE:
+        text += f", {100 * used:.0f} % of these between {counts.min_m:g} and {counts.max_m:g} m, which count"
+        fix = f"Is the unit right (--depth-scale)? {guess}." if (guess := likely_units(median_m, scale)) else ""
+        fix = f"{fix} What is farther away counts with --set depth.max_m=METRES.".strip()
+        return Finding("depth", Level.LOOK, text, fix)
     if share < MEASURED_SHARE / 2:
         fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
         return Finding("depth", Level.LOOK, text, fix)

@@ -79,6 +79,7 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     from p2p_lib.datasets.mask_log import FILE as MASK_LOG
     from p2p_lib.datasets.models import given_models
     from p2p_lib.datasets.runs import load_run
+    from p2p_lib.datasets.sequence import LIVE
     from p2p_lib.evaluation.consistency import consistency
     from p2p_lib.evaluation.known_size import lengths, that_fit
     from p2p_lib.evaluation.protocol import evaluate
@@ -105,7 +106,10 @@ def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:
     said = [of for of in (score, judged) if of is not None]
     _show(said[0], a.json, bool(run.info.get("offline")), *said[1:])
     print("".join(f"{line}\n" for line in that_fit(measured) if not a.json), end="")
-    if not (score or a.json or (a.run / MASK_LOG).is_file()):
+    if not run.info["finished"] and not a.json:
+        goes_on = "" if run.info["format"] == LIVE else f" Go on with it: {again(run.info, a.run)} --resume"
+        warn(f"p2p eval: the run is not finished, {run.info['frames']} frames of it are there.{goes_on}")
+    elif not (score or a.json or (a.run / MASK_LOG).is_file()):
         then = f"Next: {again(run.info, a.run)} --force"
         warn(f"p2p eval: where seen and mask IoU are empty, because no {MASK_LOG} was kept. {then}")
 

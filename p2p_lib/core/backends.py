@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.checked_answers import CheckedDetector
 from p2p_lib.core.checked_tracker import CheckedTracker
 from p2p_lib.core.config import SamplingConfig, SegmentationConfig, TrackingConfig
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
@@ -40,11 +41,19 @@ SEGMENTERS = {
     "sam2_video_base_plus": "p2p_lib.segmenters.sam2_video:load_base_plus",
     "sam2_video_large": "p2p_lib.segmenters.sam2_video:load_large",
 }
-#: What a part has besides its name (:mod:`p2p_lib.core.interfaces`).
-PROMISES = {
-    "tracker": ("latency_frames", "start", "add", "track", "drop", "reject", "suggest"),
-    "detector": ("detect",),
-    "segmenter": ("names", "segment", "remove"),
+#: What a part has besides its name, and what each method is called with (:mod:`p2p_lib.core.interfaces`).
+PROMISES: dict[str, dict[str, tuple[str, ...] | None]] = {
+    "tracker": {
+        "latency_frames": None,
+        "start": ("frame", "camera"),
+        "add": ("uv_px",),
+        "track": ("frame", "search", "urgent"),
+        "drop": ("ids",),
+        "reject": ("ids",),
+        "suggest": ("ids", "uv_px"),
+    },
+    "detector": {"detect": ("frame", "mask")},
+    "segmenter": {"names": None, "segment": ("frame", "prompts", "hints"), "remove": ("name",)},
 }
 #: What runs when none is named.
 DEFAULT_TRACKER, DEFAULT_DETECTOR, DEFAULT_SEGMENTER = "builtin", "corners", "builtin"
@@ -66,8 +75,8 @@ def make_tracker(
 
 
 def make_detector(detector: str | Detector, config: SamplingConfig, rng: np.random.Generator | None = None) -> Detector:
-    """The detector of this name, or the one given; :class:`BadInput` lists the known names."""
-    return _made("detector", detector, DETECTORS, config, rng)
+    """The detector of this name, or the one given, checked as it answers; :class:`BadInput` lists the known names."""
+    return CheckedDetector(_made("detector", detector, DETECTORS, config, rng))
 
 
 def make_segmenter(segmenter: str | Segmenter, camera: Camera, config: SegmentationConfig) -> Segmenter:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.checked_answers import kind_of
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks
@@ -47,7 +48,7 @@ class CheckedTracker:
         """Add queries (N, 2) in the newest frame; returns their ids (N,), above all that were given before."""
         ids, n = self._tracker.add(uv_px), len(uv_px)
         if not isinstance(ids, np.ndarray) or ids.dtype.kind not in "iu" or ids.shape != (n,):
-            raise self._bad("add()", _kind(ids), f"the ids of {n} points, a NumPy array ({n},) of whole numbers")
+            raise self._bad("add()", kind_of(ids), f"the ids of {n} points, a NumPy array ({n},) of whole numbers")
         if (falls := np.flatnonzero(np.diff(ids.astype(np.int64), prepend=self._last) <= 0)).size:
             at = int(falls[0])
             got = f"id {ids[at]} after {ids[at - 1] if at else self._last}"
@@ -78,11 +79,11 @@ class CheckedTracker:
     def _checked(self, call: str, tracks: Tracks) -> Tracks:
         """Tracks with a row for each live query, sorted, of which what is visible is somewhere."""
         if not isinstance(tracks, Tracks):
-            raise self._bad(call, _kind(tracks), "Tracks(ids, uv_px, visible, uncertainty)")
+            raise self._bad(call, kind_of(tracks), "Tracks(ids, uv_px, visible, uncertainty)")
         for name, (kinds, called) in _COLUMNS.items():
             column = getattr(tracks, name)
             if not isinstance(column, np.ndarray) or (column.dtype.kind not in kinds and len(column)):
-                raise self._bad(f"{call} {name}", _kind(column), f"a NumPy array of {called}")
+                raise self._bad(f"{call} {name}", kind_of(column), f"a NumPy array of {called}")
         ids, uv_px, visible = tracks.ids, tracks.uv_px, tracks.visible
         if (falls := np.flatnonzero(ids[1:] <= ids[:-1])).size:
             got = f"a row of id {ids[falls[0] + 1]} after one of id {ids[falls[0]]}"
@@ -105,8 +106,3 @@ class CheckedTracker:
         at = f", frame {self._frame}" if self._frame >= 0 else ""
         who = f"tracker {self.name!r} ({type(self._tracker).__name__}){at}: {call}"
         return BadInput(who, got, expected, fix)
-
-
-def _kind(value: object) -> str:
-    """What came in the place of an array."""
-    return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__

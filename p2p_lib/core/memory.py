@@ -195,6 +195,8 @@ def far_fewer_pixels(memory: ObjectMemory, camera: Camera) -> str:
 
 def save_memory(path: str | Path, memory: ObjectMemory) -> None:
     """Write a memory as one ``.npz`` file of arrays and JSON, whole or not at all."""
+    if not isinstance(memory, ObjectMemory):
+        raise BadInput("save_memory", type(memory).__name__, "a path and a memory, as tracker.memory(NAME) gives it")
     save_memories(path, {memory.name: memory}, _KIND, {})
 
 

@@ -65,7 +65,7 @@ def find(kind: str, name: str, known: Mapping[str, str]) -> Callable[..., Any]:
             return _theirs(kind, name, name)
     points = offered(kind)
     if name not in points:
-        names = [*known, *points]
+        names = list(dict.fromkeys([*known, *points]))
         expected = f"one of {', '.join(names)}, or your own as package.module:Class"
         raise BadInput(_SAID.get(kind, kind), repr(name), expected, did_you_mean(name, names))
     return _theirs(kind, name, points[name].value)
@@ -108,7 +108,8 @@ def _theirs(kind: str, name: str, where: str) -> Callable[..., Any]:
             fix = f"Install that, or mend the import: python -c 'import {module}' shows where it is."
         raise MissingBackend(f"{said} {name}", f"{module} {what} ({in_a_line(error)})", fix) from error
     if attribute and not hasattr(found, attribute):
-        near = did_you_mean(attribute, [key for key in vars(found) if not key.startswith("_")], f"{module}:")
+        own = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]
+        near = did_you_mean(attribute, own, f"{module}:")
         raise BadInput(said, repr(name), f"something called {attribute} in {found.__name__}", near)
     part = getattr(found, attribute) if attribute else found
     call = f"{attribute}({', '.join(CALLED_WITH[kind])})"
@@ -116,21 +117,15 @@ def _theirs(kind: str, name: str, where: str) -> Callable[..., Any]:
         of = type(part).__name__
         fix = f"Did you mean {module}:{of}?" if hasattr(found, of) else ""
         raise BadInput(f"{said} {name}", f"an instance of {of}", f"a class or a function, called as {call}", fix)
-    try:
-        signature = inspect.signature(part)
-    except ValueError:  # of compiled code nobody knows
-        return part
-    try:
-        signature.bind(*CALLED_WITH[kind])
-    except TypeError as error:
-        got = f"{attribute}{signature}, which cannot be called so ({error})"
-        raise BadInput(f"{said} {name}", got, f"{call}, see CONTRIBUTING.md") from error
+    if trouble := _cannot_be_called(part, CALLED_WITH[kind]):
+        raise BadInput(f"{said} {name}", f"{attribute}{trouble}", f"{call}, see CONTRIBUTING.md")
     return part
 
 
-def check_part(kind: str, part: Any, has: Iterable[str], name: str = "") -> None:
+def check_part(kind: str, part: Any, has: Mapping[str, tuple[str, ...] | None], name: str = "") -> None:
     """Refuse a part without a ``name``, or some of ``has``; :class:`BadInput` says what.
 
+    has   what it has: a method with what it is called with, or None for what is no method
     name  by which it was asked for
     """
     said = f"{kind} {name}".strip()
@@ -141,3 +136,26 @@ def check_part(kind: str, part: Any, has: Iterable[str], name: str = "") -> None
         raise BadInput(said, got, f"a {kind}, see CONTRIBUTING.md")
     if not isinstance(part.name, str):
         raise BadInput(f"{said}: name", repr(part.name), "a text")
+    for key, called_with in has.items():
+        own = getattr(part, key)
+        if called_with is None and inspect.ismethod(own):
+            fix = "Put @property before it."
+            raise BadInput(f"{said} ({type(part).__name__}): {key}", "a method", "a value, not a method", fix)
+        if called_with is not None and (trouble := _cannot_be_called(own, called_with)):
+            got, expected = f"{key}{trouble}", f"{key}({', '.join(called_with)}), see CONTRIBUTING.md"
+            raise BadInput(f"{said} ({type(part).__name__})", got, expected)
+
+
+def _cannot_be_called(part: Any, arguments: tuple[str, ...]) -> str:
+    """What comes instead of something that can be called with these arguments; empty where it can."""
+    if not callable(part):
+        return f" = {part!r}"
+    try:
+        signature = inspect.signature(part)
+    except ValueError:  # of compiled code nobody knows
+        return ""
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        return f"{signature}, which cannot be called so ({error})"
+    return ""

@@ -106,7 +106,7 @@ def check_apart(others: Iterable[Prompt], prompt: Prompt, where: str = "") -> No
 
 
 def check_depth(prompt: Prompt, frame: Frame) -> None:
-    """Refuse clicks none of which has depth, for they say where in space the object is; a box without any in it."""
+    """Refuse clicks none of which has depth, for they say where in space the object is; a box or mask without any."""
     at = prompt.points_px
     if len(at) and not np.isfinite(depths_at(at, frame)).any():
         got = f"{_pixel(at[0])} has no depth in frame {frame.index}"
@@ -114,6 +114,9 @@ def check_depth(prompt: Prompt, frame: Frame) -> None:
     if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
         raise BadInput(f"box around {prompt.name!r}", got, "measured pixels near its centre", "Click on the object.")
+    if prompt.mask is not None and prompt.mask.any() and not (frame.depth_m[prompt.mask] > 0).any():
+        got = f"no depth inside it in frame {frame.index}"
+        raise BadInput(f"mask of {prompt.name!r}", got, "measured pixels", "Give it again in a frame with depth.")
 
 
 def check_not_on(prompt: Prompt, other: Prompt, where: str = "") -> None:

@@ -9,17 +9,16 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Condition, Event
+from threading import Condition, Event, Thread
 from time import monotonic
 from typing import Protocol
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, doubt
 from p2p_lib.core.plugins import check_part, find, is_place
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
@@ -27,6 +26,8 @@ from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
 DEFAULT_RATE_HZ = 30.0
 #: So many frames may wait: a search or a keyframe takes as long as some frames, and those after it make up for that.
 DEFAULT_BACKLOG = 4
+#: How long a camera that was closed may take to come back from ``read``, s.
+_PATIENCE_S = 3.0
 
 
 class LiveCamera(Protocol):
@@ -116,7 +117,7 @@ class OwnCamera:
 
     def __init__(self, spec: str, own: LiveCamera):
         self._spec, self._own, self._closed, self._last = spec, own, False, -1
-        check_part("camera", own, ("camera", "read", "close"), spec)
+        check_part("camera", own, {"camera": None, "read": (), "close": ()}, spec)
         if not isinstance(own.camera, Camera):
             raise BadInput(f"camera {spec}: camera", type(own.camera).__name__, "a p2p_lib.Camera")
         self.name, self.camera = own.name, own.camera
@@ -175,9 +176,11 @@ class Newest:
         self._source, self._keep, self._most = source, frozenset(keep), backlog + 1
         self._stop, self.stopped = stop, False
         self._waiting: deque[Frame] = deque()
-        self._changed, self._ended = Condition(), False
-        self._pool = ThreadPoolExecutor(1)
-        self._grabbing = self._pool.submit(self._grab)
+        self._changed, self._ended, self._closed = Condition(), False, False
+        self._error: BaseException | None = None  # what ended the camera
+        # A daemon: somebody's camera that waits for ever must not keep the process.
+        self._thread = Thread(target=self._grab, daemon=True, name="p2p camera")
+        self._thread.start()
 
     def take(self) -> Frame | None:
         """The next frame; waits for one. None at the end; raises what ended the camera, if anything."""
@@ -185,19 +188,24 @@ class Newest:
             self._changed.wait_for(lambda: self._waiting or self._ended)
             if self._waiting:
                 return self._waiting.popleft()
-        self._grabbing.result()
+        if self._error is not None:
+            raise self._error
         return None
 
     def __enter__(self) -> Newest:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._closed = True
         self._source.close()
-        self._pool.shutdown(wait=True)
+        self._thread.join(_PATIENCE_S)
+        if self._thread.is_alive():
+            got = f"still in read(), {_PATIENCE_S:g} s after close()"
+            doubt(f"camera {self._source.name}", got, "Its close() has to make a read() that waits return None.")
 
     def _grab(self) -> None:
         try:
-            while (frame := self._source.read()) is not None:
+            while not self._closed and (frame := self._source.read()) is not None:
                 if frame.index >= self._stop:
                     self.stopped = True
                     return
@@ -207,6 +215,8 @@ class Newest:
                     if len(idle) > self._most:
                         self._waiting.remove(idle[0])
                     self._changed.notify()
+        except BaseException as error:  # noqa: BLE001 - raised where frames are taken
+            self._error = error
         finally:
             with self._changed:
                 self._ended = True

@@ -94,10 +94,17 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str = "") -> tuple[Path, ...]:
-    """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order."""
-    if len(files) == len(reference):
-        return files
+    """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order.
+
+    Where most are called alike, all have to be: else one is missing here and one there, and those between are shifted.
+    """
     stems, wanted = {p.stem for p in files}, {p.stem for p in reference}
+    if len(files) == len(reference):
+        if not len(reference) > len(stems & wanted) >= len(reference) / 2:
+            return files
+        got = f"no {min(wanted - stems)}{files[0].suffix}, and {min(stems - wanted)}{files[0].suffix} instead"
+        expected = f"one for each in {reference[0].parent}, called alike"
+        raise BadInput(str(files[0].parent), got, expected, "Take out what has no counterpart.")
     odd, fault = (wanted - stems, "missing") if len(files) < len(reference) else (stems - wanted, "too many")
     if odd and stems & wanted:
         hint = f"{min(odd)}{files[0].suffix} is {fault}. {hint}".strip()

@@ -43,7 +43,9 @@ class Lengths:
         if not off or (len(off) < len(self._measured) and min(off) < 1):  # the other has seen all of it
             return ""
         factor = float(np.median(off))
-        text = f"known to be {100 * self.known_m:.1f} cm long, measured {self._found}, {factor:.2f} times"
+        text = f"known to be {100 * self.known_m:g} cm long, measured {self._found}, {factor:.2f} times"
+        if 80 < factor < 125:
+            return f"{text}: sizes are in centimetres, {100 * self.known_m:g} may be metres"
         besides = "its length was never in view" if factor < 1 else "masks hold more than the object"
         return f"{text}: focal length or depth scale is wrong by this factor, or {besides}"
 

@@ -17,7 +17,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name
-from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
@@ -100,7 +100,7 @@ class Point2Pose(Savable):
         camera: Camera,
         config: Config | str | None = None,
         tracker: str | PointTracker = backends.DEFAULT_TRACKER,
-        detector: str = backends.DEFAULT_DETECTOR,
+        detector: str | Detector = backends.DEFAULT_DETECTOR,
         segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
     ):
         config = as_config("default" if config is None else config)
@@ -142,6 +142,8 @@ class Point2Pose(Savable):
         Raises :class:`BadInput` for a memory together with clicks or masks, and with preset ``paper``.
         """
         if memory is None:
+            if frozen:
+                raise BadInput("add_object", "frozen without a memory", "a memory, whose map is then kept as it is")
             super().add_object(name, mask, clicks, negative, box)
             return
         alone = mask is clicks is negative is box is None

@@ -13,6 +13,8 @@ from p2p_lib.core.types import Frame
 
 #: Depth, colour or both may repeat for so long, s: some cameras deliver one of them less often.
 _STANDS_S = 0.08
+#: So long between frames, s, so many times in a row, is a time in another unit.
+_SLOW_S, _SLOW_FRAMES = 10.0, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class FrameGuard:
     def __init__(self, moments: bool = True):
         self._moments = moments
         self._time_s, self._stopped, self._warned = -np.inf, False, False  # of the frame before
-        self._stale = StaleFrames()
+        self._stale, self._slow = StaleFrames(), 0  # how many frames in a row came so slowly
         self._newest: Frame | None = None
 
     def __call__(self, frame: Frame) -> Frame:
@@ -69,6 +71,10 @@ class FrameGuard:
         """
         before_s, self._time_s = self._time_s, frame.time_s
         stopped, self._stopped = self._stopped, frame.time_s == before_s
+        self._slow = self._slow + 1 if _SLOW_S < frame.time_s - before_s < np.inf else 0
+        if self._slow == _SLOW_FRAMES:
+            got = f"{frame.time_s - before_s:.0f} s after the frame before, for the third time in a row"
+            doubt(f"time of frame {frame.index}", got, "Times are in seconds: divide milliseconds by 1000.")
         if frame.time_s > before_s or (stopped and self._stopped):
             return ""
         got = f"{frame.time_s:.6f} s, not later than the frame before ({before_s:.6f} s)"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.checked_answers import labelled
 from p2p_lib.core.depth import check_metres
 from p2p_lib.core.image import either
 from p2p_lib.core.interfaces import Hint, LazyHints, PointTracker, Segmenter
@@ -51,8 +52,8 @@ class Frontend:
 
     def track(self, inputs: FrameInputs) -> FrameInputs | None:
         """Follow all points into a frame; returns the frame of the tracks, None while a late tracker has none."""
-        self.waiting.append(inputs)
         tracks = self._tracked(inputs.frame, inputs.masks)
+        self.waiting.append(inputs)  # only then: a frame at which the tracker fails is left out
         if len(self.waiting) <= self.tracker.latency_frames:
             return None
         for obj in self.objects.values():
@@ -84,7 +85,7 @@ class Frontend:
             return
         with self.stopwatch("segmentation"):
             sought = [name for name in self.segmenter.names if name in masks and masks[name] is None]
-            labels = self.segmenter.segment(frame, prompts.values(), self.hints(frame, sought))
+            labels = labelled(self.segmenter, frame, tuple(prompts.values()), self.hints(frame, sought))
             label_of = {name: label for label, name in enumerate(self.segmenter.names, 1)}
             looked_after = [name for name, mask in masks.items() if mask is None and name in label_of]
             self.masks = masks | {name: labels == label_of[name] for name in looked_after}

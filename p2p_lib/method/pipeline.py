@@ -23,7 +23,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import uninterrupted
 from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.objects import FollowedT, Objects
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
@@ -60,7 +60,7 @@ class Point2Pose(Objects[FollowedT]):
         camera: Camera,
         config: Config | str = "paper",
         tracker: str | PointTracker = backends.DEFAULT_TRACKER,
-        detector: str = backends.DEFAULT_DETECTOR,
+        detector: str | Detector = backends.DEFAULT_DETECTOR,
         segmenter: str | Segmenter = backends.DEFAULT_SEGMENTER,
         parts: Parts | None = None,
     ):

@@ -350,6 +350,15 @@ def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit,
     assert limit in wrong.fix and scale in wrong.fix
 
 
+@pytest.mark.parametrize("times", [1, 5])
+def test_without_objects_depth_out_of_range_is_looked_at(good, tmp_path, times):
+    folder = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), times)
+    shutil.rmtree(folder / "masks")
+    (found,) = (finding for finding in check_folder(folder) if finding.name == "depth")
+    assert found.level is (Level.OK if times == 1 else Level.LOOK)
+    assert times == 1 or ("between 0.1 and 2.5 m, which count" in found.text and "--set depth.max_m" in found.fix)
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(1, None), (0.1, "0.01 (centimetres)"), (5, "0.0002 (TUM RGB-D)")])
 @pytest.mark.parametrize("masks", ["dataset", "clicks"])
 def test_a_run_says_at_its_first_masks_that_depth_is_out_of_range(good, tmp_path, factor, unit, masks):

@@ -1035,7 +1035,13 @@ def test_an_object_of_ones_own_is_tracked_without_score(sequence, tmp_path, caps
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
     assert "my board" in out and "mask IoU" in out and err == ""
-    (tmp_path / "out" / "masks.npz").unlink()  # as of a run that was killed
+    info = json.loads((tmp_path / "out" / "run.json").read_text())
+    (tmp_path / "out" / "run.json").write_text(json.dumps(info | {"finished": False}))  # as of a run that was killed
+    assert cli.main(["eval", str(tmp_path / "out")]) == 0
+    err = capsys.readouterr().err
+    assert re.search(r"the run is not finished, 8 frames of it are there. Go on with it: .* --resume$", err.strip())
+    (tmp_path / "out" / "run.json").write_text(json.dumps(info))
+    (tmp_path / "out" / "masks.npz").unlink()
     assert cli.main(["eval", str(tmp_path / "out")]) == 0
     out, err = capsys.readouterr()
     assert err.count("\n") == 1 and "where seen and mask IoU are empty" in err

@@ -10,6 +10,7 @@ import socket
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -27,12 +28,12 @@ from p2p_lib.apps.live_words import Words, outlet
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, Doubt, MissingData
 from p2p_lib.core.memory import load_memory
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import WITH_POSE, Frame, PoseEstimate, Status
-from p2p_lib.datasets import run_writer
+from p2p_lib.datasets import cameras, run_writer
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import run_lengths, save_prompts
@@ -145,6 +146,42 @@ def test_leaving_ends_the_thread(scripted):
     with Newest(scripted):
         assert threading.active_count() == before + 1
     assert scripted.closed and threading.active_count() == before
+
+
+class Careless(Scripted):
+    """A camera whose close() does nothing: it goes on for ever, or waits for ever where ``waits``."""
+
+    def __init__(self, camera: Camera, waits: bool):
+        super().__init__(camera)
+        self.waits, self.reads = waits, 0
+
+    def read(self):
+        self.reads += 1
+        time.sleep(3600 if self.waits and self.reads == 3 else 0.001)
+        return picture(self.reads)
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_camera_that_does_not_close_keeps_nobody(scripted, waits, monkeypatch):
+    monkeypatch.setattr(cameras, "_PATIENCE_S", 0.3)
+    careless = Careless(scripted.camera, waits)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with pytest.raises(RuntimeError, match="the user's own"), Newest(careless) as newest:
+            newest.take()
+            while careless.reads < 3:
+                time.sleep(0.001)
+            raise RuntimeError("the user's own")
+    found = [str(doubt.message) for doubt in said if doubt.category is Doubt]
+    assert len(found) == waits and all(
+        "camera scripted: still in read(), 0.3 s after close()" in text for text in found
+    )
+    reads = careless.reads
+    time.sleep(0.05)
+    assert careless.reads == reads
 
 
 def test_a_folder_plays_at_its_rate(folder):
@@ -858,7 +895,7 @@ def test_images_after_the_stop_push_none_out(folder, backlog, kept, monkeypatch)
     taken = Newest.take
 
     def take(newest):  # as a tracker that is slower than any camera
-        newest._grabbing.exception()
+        newest._thread.join()
         return taken(newest)
 
     monkeypatch.setattr(Newest, "take", take)

@@ -224,11 +224,6 @@ def test_a_module_that_does_not_load_says_what_of_it(theirs, line, error, said):
     ("option", "part", "said"),
     [
         ("tracker", "Unlucky", r"Unlucky.track raised ValueError: no luck today \(\S+their_parts.py:(\d+)\)"),
-        (
-            "tracker",
-            "Narrow",
-            r"Narrow raised TypeError: Narrow.track\(\) takes 2 positional arguments but 4 were given",
-        ),
         ("detector", "Blind", r"Blind.detect raised FileNotFoundError: .*weights' \(\S+their_parts.py:(\d+)\)"),
         ("masks", "Torn", r"Torn.segment raised KeyError: 'labels' \(\S+their_parts.py:(\d+)\)"),
         ("format", "unread", r"unread raised ValueError: no luck today \(\S+their_parts.py:(\d+)\)"),
@@ -247,6 +242,41 @@ def test_what_a_part_raises_is_said_with_its_place(theirs, sequence, tmp_path, c
         source = CODE.replace("\\\\", "\\").splitlines()[int(found[1]) - 1]
         assert "raise ValueError" in source or "nowhere" in source or "labels" in source
     assert cli.main([*words, "--debug", "--force"]) == 2 and "Traceback" in capsys.readouterr().err
+
+
+def test_a_part_whose_methods_are_called_otherwise_is_refused_before_anything_runs(theirs):
+    said = r"tracker their_parts:Narrow \(Narrow\): got track\(frame\), .* expected track\(frame, search, urgent\), see"
+    with pytest.raises(BadInput, match=said):
+        make_tracker("their_parts:Narrow", preset().tracking)
+    camera, config = Camera(100, 100, 10, 10, 20, 20), preset().segmentation
+    own = make_segmenter("their_parts:Cutter", camera, config)
+    own.remove = None
+    with pytest.raises(BadInput, match=r"segmenter \(Cutter\): got remove = None, expected remove\(name\)"):
+        make_segmenter(own, camera, config)
+
+    class Called:
+        name = "called"
+
+        def names(self):
+            return ()
+
+        def segment(self, frame, prompts, hints):
+            return None
+
+        def remove(self, name):
+            return None
+
+    with pytest.raises(BadInput, match=r"segmenter \(Called\): names: got a method, .* Put @property before it"):
+        make_segmenter(Called(), camera, config)
+
+
+def test_a_near_name_is_one_that_can_be_called(theirs):
+    with pytest.raises(BadInput, match=r"something called load_it in their_parts. Did you mean their_parts:load\?"):
+        make_tracker("their_parts:load_it", preset().tracking)
+    (theirs / "their_parts.py").write_text("import numpy as nq")
+    sys.modules.pop("their_parts")
+    with pytest.raises(BadInput, match=r"something called nd in their_parts$"):
+        make_tracker("their_parts:nd", preset().tracking)
 
 
 def test_a_mistake_of_ours_is_none_of_theirs(theirs, sequence, tmp_path, monkeypatch):

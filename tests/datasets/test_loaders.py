@@ -174,6 +174,17 @@ def test_fault_names_the_file(sequence, fault):
     assert_named(sequence, expected)
 
 
+def test_images_of_other_names_between_are_not_paired_by_their_number(sequence):
+    """One colour image and another one's depth were lost: as many of each, and all between are shifted."""
+    (sequence / "depth" / "0000.png").rename(sequence / "depth" / f"{N:04d}.png")
+    assert_named(
+        sequence, rf"depth: got no 0000\.png, and {N:04d}\.png instead, expected .*rgb, called alike. Take out"
+    )
+    for i in range(1, N + 1):
+        (sequence / "depth" / f"{i:04d}.png").rename(sequence / "depth" / f"depth_{i:04d}.png")
+    read_all(sequence)
+
+
 def test_a_camera_matrix_may_stand_in_one_line(sequence):
     put(sequence / "cam_K.txt", "50 0 20 0 51 15 0 0 1")
     camera = open_sequence(sequence).camera

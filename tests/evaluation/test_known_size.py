@@ -53,3 +53,8 @@ def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies_and_whatever_stic
         0.2, rel=0.02
     )  # the box fitted around it is not the smallest to the last percent
     assert np.isnan(mesh_length_m(tmp_path / "none.ply"))
+
+
+def test_a_size_in_metres_is_told_from_a_wrong_camera():
+    assert "sizes are in centimetres, 0.12 may be metres" in Lengths(0.0012, 0.13, 0.12).doubt
+    assert "focal length" in Lengths(0.06, 0.13, 0.12).doubt

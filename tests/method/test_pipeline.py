@@ -3,6 +3,7 @@
 import builtins
 import re
 import signal
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -312,6 +313,30 @@ def test_time_that_runs_backwards_is_warned_of_once_and_statuses_are_logged(capl
     assert [reason.partition("; ")[2] or reason for reason in reasons] == ["", "", "", *told, ""], "each in its frame"
     changes = 1 + sum(a["left"].status != b["left"].status for a, b in pairwise(estimates))
     assert len(caplog.messages) == changes and {record.name for record in caplog.records} == {"p2p_lib"}
+
+
+@pytest.mark.parametrize("unit_s", [1, 1e-3, 1e-6])
+def test_times_in_another_unit_are_doubted_once(unit_s):
+    frames = [(replace(frame, time_s=1.7e9 + frame.time_s / unit_s), masks) for frame, masks in film()[:8]]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        track(frames, names=("left",))
+    about_time = [str(of.message) for of in said if "time of frame" in str(of.message)]
+    assert len(about_time) == (unit_s < 1)
+    assert all("time of frame 3: 33" in text and "divide milliseconds by 1000" in text for text in about_time)
+
+
+def test_a_mask_where_no_depth_is_says_so_until_it_is_given_again():
+    method, frames = Point2Pose(CAMERA, quick()), film()[:5]
+    frame, masks = frames[0]
+    method.add_object("left", mask=masks["left"])
+    found = [method.step(replace(frame, depth_m=np.zeros_like(frame.depth_m)))["left"]]
+    found += [method.step(frame)["left"] for frame, _ in frames[1:3]]
+    why = "mask of 'left': got no depth inside it in frame 0, expected measured pixels. Give it again in a frame with"
+    assert str(method.refused["left"]).startswith(why) and all(each.T_cam_obj is None for each in found)
+    assert [each.reason.startswith(why) for each in found[1:]] == [True, True]
+    method.correct("left", mask=frames[3][1]["left"])
+    assert method.step(frames[3][0])["left"].T_cam_obj is not None and not method.refused
 
 
 def test_nobody_knows_the_masks():
