@@ -60,7 +60,7 @@ def check_candidates(detector: Detector, frame: Frame, mask: np.ndarray, found: 
 
 
 def labelled(segmenter: Segmenter, frame: Frame, prompts: Collection[Prompt], hints: Mapping[str, Hint]) -> np.ndarray:
-    """The label image (H, W) of the next frame, checked (:meth:`~p2p_lib.core.interfaces.Segmenter.segment`)."""
+    """The label image (H, W) of the next frame, checked (:class:`~p2p_lib.core.interfaces.Segmenter`)."""
     labels = segmenter.segment(frame, prompts, hints)
     check_labels(segmenter, frame, prompts, labels)
     return labels

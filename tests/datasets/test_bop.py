@@ -142,7 +142,8 @@ def test_changing_cameras_are_refused(scene):
 
 
 def test_a_picture_without_a_number_is_refused(scene):
-    (scene / "rgb/000001.png").rename(scene / "rgb/first.png")
+    for part in ("rgb", "depth"):
+        (scene / part / "000001.png").rename(scene / part / "first.png")
     with pytest.raises(BadInput, match=r"first\.png: got the name"):
         open_sequence(scene)
     (scene / "rgb").rename(scene / "gray")
