@@ -10,6 +10,7 @@ import pytest
 from p2p_lib import open_sequence
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.memory import save_memory
 from p2p_lib.core.types import NOT_FOUND, Status, status_text, status_word
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.method import pipeline
@@ -25,6 +26,16 @@ def followed(method: Point2Pose, frames) -> list:
     for name in ("left", "right"):
         method.add_object(name)
     return [method.step(frame, masks) for frame, masks in frames]
+
+
+def test_a_map_that_is_kept_as_it_is_needs_a_memory():
+    with Point2Pose(CAMERA, quick()) as method, pytest.raises(BadInput, match="frozen without a memory"):
+        method.add_object("left", frozen=True)
+
+
+def test_a_memory_and_its_path_the_wrong_way_round_are_told(tmp_path):
+    with pytest.raises(BadInput, match="save_memory: got str, expected a path and a memory"):
+        save_memory(MEMORY, str(tmp_path / "mug.npz"))
 
 
 def test_a_look_alike_that_shows_first_gets_no_map():
