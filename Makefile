@@ -34,8 +34,10 @@ figures: setup ## every table and figure of the paper from the data and backends
 test: setup ## linter and types, then all tests, every notebook included, and the API reference
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
-	@.venv/bin/mypy
-	@.venv/bin/python tools/docs.py
+	@# Types on one core; the API reference, and what would be compiled once in each test process, on the other.
+	@.venv/bin/mypy & types=$$!; \
+	    .venv/bin/python tools/docs.py && .venv/bin/python -c "import p2p_lib; p2p_lib.warm_up()"; rest=$$?; \
+	    wait $$types && exit $$rest
 	@.venv/bin/python -m pytest --numprocesses=2 --dist=loadfile --durations=5
 
 docs: setup ## the API reference from the docstrings, pages that work offline, into out/docs

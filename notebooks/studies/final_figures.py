@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -39,15 +39,28 @@ if TYPE_CHECKING:
     from IPython.display import Markdown
 
 
-def run_quick_here(plans: Iterable[str], out: Path) -> None:
-    """Run in this process what ``out`` lacks of the quick form of plans.
+#: Plans whose quick form is run where there is nothing in full: images are drawn from them, or no table is shipped.
+RUN_HERE = ("ho3d", "long_range", "segmenters", "ycbmultitrack_real")
 
-    A process of its own, as ``p2p benchmark`` has for each run, takes as long to begin as one of these runs takes.
+
+def results_to_show(
+    plans: Iterable[str], out: Path, profile: str, run_here: Container[str] = RUN_HERE
+) -> dict[str, Benchmark]:
+    """Plan to what ``out`` has of it in full; where it has nothing, or ``profile`` is quick, to its quick form.
+
+    That is run in this process, for those of ``run_here``: a process of its own, as ``p2p benchmark`` has for each
+    run, takes as long to begin as one of these runs takes.
     """
-    for plan in plans:
-        for job, outcome in load_benchmark(plan, out, "quick").results:
+    results = {}
+    for name in plans:
+        results[name] = load_benchmark(name, out, profile)
+        if profile == "full" and results[name].counts()["done"]:
+            continue
+        for job, outcome in load_benchmark(name, out, "quick").results if name in run_here else ():
             if job.key and outcome.status == "not run":
                 save_outcome(out, perform(measured, job, out, library_version()))
+        results[name] = load_benchmark(name, out, "quick")
+    return results
 
 
 def shown_table(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Markdown:

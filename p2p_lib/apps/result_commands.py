@@ -109,7 +109,9 @@ def _film(a: argparse.Namespace) -> None:
 )
 def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study
+    from p2p_lib.core.compiled import warm_up
 
     parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
+    warm_up(warn)  # once, and not in every kernel that begins meanwhile
     how = {"only": names(a.only) or (), "jobs": a.jobs, "parameters": parameters, "out": a.out}
     study("runner").run_notebooks(a.profile, **how)

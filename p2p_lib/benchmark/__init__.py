@@ -4,7 +4,7 @@
 Look first at :mod:`p2p_lib.benchmark.plan` (what is to run) and :mod:`p2p_lib.benchmark.benchmark` (how it is run).
 """
 
-from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark, load_or_run_quick, run_benchmarks
+from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark, run_benchmarks
 from p2p_lib.benchmark.plan import Plan, plan_names, read_plan
 
-__all__ = ["Benchmark", "Plan", "load_benchmark", "load_or_run_quick", "plan_names", "read_plan", "run_benchmarks"]
+__all__ = ["Benchmark", "Plan", "load_benchmark", "plan_names", "read_plan", "run_benchmarks"]

@@ -173,18 +173,6 @@ def load_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "ful
     return Benchmark(plan, profile, out, tuple(results))
 
 
-def load_or_run_quick(plans: Iterable[str], out: str | Path, profile: str) -> dict[str, Benchmark]:
-    """Plan to the results that ``out`` has of it in full; where it has none, or ``profile`` is quick, its quick form.
-
-    So a notebook shows what was run before, and something where nothing was.
-    """
-    names = list(plans)
-    full = {name: load_benchmark(name, out) for name in names} if profile == "full" else {}
-    full = {name: benchmark for name, benchmark in full.items() if benchmark.counts()["done"]}
-    quick = run_benchmarks([name for name in names if name not in full], out, "quick", progress=False)
-    return full | {b.plan.name: b for b in quick}
-
-
 def _run(
     outcomes: Generator[tuple[Job, Outcome], None, None], total: int, out: Path, progress: bool
 ) -> dict[str, Outcome]:

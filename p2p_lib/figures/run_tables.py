@@ -101,6 +101,8 @@ def by_pair(numbers: Numbers) -> Table:
             levels = [[own[at] for at in own if scene in ("", at[0])] for scene in ("", *scenes)]
             means = [np.mean(level, axis=0) if level else [None, None] for level in levels]
             cells = [number(v, digits=1) for v in means[0]] + [number(mean[1], digits=1) for mean in means[1:]]
+            absent = numbers.nothing_ran(method)
+            cells = [absent if cell.text == Cell().text else cell for cell in cells]
             lines.append([Cell(method.name), Cell("with all"), Cell(str(len(own))), *cells])
             continue
         worth = {at: base[at] - own[at] for at in own if at in base}

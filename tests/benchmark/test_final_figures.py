@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from p2p_lib.benchmark import load_benchmark, load_or_run_quick, read_plan, run_benchmarks
+from p2p_lib.benchmark import load_benchmark, read_plan, run_benchmarks
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.datasets.keypoint_log import load_keypoints
@@ -65,13 +65,16 @@ def test_the_note_of_a_picture_names_the_runs(whole):
 
 
 def test_results_in_full_are_shown_and_the_quick_form_runs_where_there_are_none(whole, plan, tmp_path):
-    full = load_or_run_quick([str(plan)], whole.out, "full")
+    name = str(plan)
+    full = final_figures.results_to_show([name], whole.out, "full", [name])
     assert [b.profile for b in full.values()] == ["full"]
     nothing = load_benchmark(plan, tmp_path)
     assert nothing.counts() == {"done": 0, "failed": 0, "not run": 8}
     assert {outcome.reason for _, outcome in nothing.results} == {"not run yet: p2p benchmark slides"}
     assert not any(tmp_path.iterdir()), "looking leaves nothing behind"
-    (quick,) = load_or_run_quick([str(plan)], tmp_path, "full").values()
+    (unasked,) = final_figures.results_to_show([name], tmp_path, "quick", []).values()
+    assert unasked.counts() == {"done": 0, "failed": 0, "not run": 2}
+    (quick,) = final_figures.results_to_show([name], tmp_path, "full", [name]).values()
     assert quick.profile == "quick" and quick.counts()["done"] == 2
 
 

@@ -147,6 +147,10 @@ def test_pairs_are_differences_run_against_run(tmp_path):
     mean, low, high = map(float, re.findall(r"[+-][\d.]+", without[4].text))
     assert mean == 2.0 and 1.0 < low < 2.0 < high < 3.0 and without[4].bold
     assert not any(cell.bold for cell in without[5:]), "three runs of a scene prove nothing"
+    (job, _), *later = made.results
+    later = [pair for pair in later if pair[0].method.against]
+    unrun = replace(made, results=((job, Outcome(key="k", status="not run", reason="later")), *later))
+    assert {cell.note for cell in paper_table(unrun).rows[0][3:]} == {"later"}
 
 
 def test_a_grid_has_a_row_per_sequence_and_the_mean_of_those_that_all_methods_ran(tmp_path):
