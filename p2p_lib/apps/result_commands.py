@@ -112,6 +112,7 @@ def _notebooks(a: argparse.Namespace) -> None:
     from p2p_lib.core.compiled import warm_up
 
     parameters = pairs(a.parameter or (), "--parameter", "NAME=VALUE")
+    runner = study("runner")
     warm_up(warn)  # once, and not in every kernel that begins meanwhile
     how = {"only": names(a.only) or (), "jobs": a.jobs, "parameters": parameters, "out": a.out}
-    study("runner").run_notebooks(a.profile, **how)
+    runner.run_notebooks(a.profile, **how)
