@@ -339,7 +339,8 @@ def _registered(frames: list[Frame]) -> Finding:
     """Whether depth was registered to the colour camera."""
     name, found = "registration", misfit(frames)
     if found is None:
-        return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree")
+        fix = "Be sure that the camera's software aligns them: what is not aligned gives poses that are wrong or lost."
+        return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree", fix)
     if found.doubt is None:
         return Finding(name, Level.OK, "edges of depth lie on edges of colour")
     text, fix = found.doubt

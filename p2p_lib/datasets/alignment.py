@@ -61,7 +61,8 @@ class Misfit:
         size = f"{self.scale:.2f} times as large and " if abs(self.scale - 1) > 0.03 else ""
         text = f"offset from colour: {size}{where}, its edges would fit {self.gain:.1f} times as well"
         how = "`align` in the camera's software; p2p convert does for RealSense"
-        return text, f"Register depth to colour when recording ({how})."
+        fix = f"Register depth to colour when recording ({how})."
+        return text, f"{fix} If it fits while nothing moves, they are of different moments: record them together."
 
 
 def misfit(frames: Sequence[Frame]) -> Misfit | None:

@@ -127,7 +127,9 @@ def consistency(
         sequence = reopen(run.info) if sequence is None else sequence
     except P2PError as error:
         no_images = str(error)
-    keypoints, masks, every = load_keypoints(run.path), load_masks(run.path), load_run(run.path, every_map=True)
+    # Those of an offline result are its run's.
+    keypoints = load_keypoints(run.path / run.info.get("masks_in", ""))
+    masks, every = load_masks(run.path), load_run(run.path, every_map=True)
     sizes = {name: of.doubt for name, of in lengths(run.path, known_m or {}).items() if of.doubt}
     objects, found, unknown = {}, {}, {}
     for name, whole in run.objects.items():
@@ -136,7 +138,8 @@ def consistency(
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks)
         doubts = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
-        evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts)
+        moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
+        evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts, moved)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
         if obj.has_pose.any() and not evidence.compared:

@@ -5,6 +5,7 @@ Nothing here judges; :mod:`p2p_lib.evaluation.suspicions` does.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,11 +84,13 @@ def gathered(
     keypoints: ObjectKeypoints | None,
     fit: SurfaceFit,
     doubts: tuple[str, ...],
+    moved: Collection[int] = (),
 ) -> RunEvidence:
     """All that is known of one object, frame by frame.
 
     every   the same object with the poses of all its maps
     doubts  what was doubted of it when the run was made
+    moved   frames whose pose an offline pass has moved far
     """
     n = len(obj)
     px, size_m, apart = np.full(n, np.nan), np.full(n, np.nan), 0.0
@@ -103,7 +106,8 @@ def gathered(
     of_poses = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
     seen, inside, off_px, jump_px = of_points
     of_surface = fit.overlap, fit.through, fit.on_surface
-    return RunEvidence(*of_poses, px, size_m, seen, inside, off_px, jump_px, *of_surface, doubts, apart)
+    far = np.isin(obj.frame_index, list(moved))
+    return RunEvidence(*of_poses, px, size_m, seen, inside, off_px, jump_px, *of_surface, far, doubts, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

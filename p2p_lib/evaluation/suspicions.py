@@ -50,6 +50,7 @@ class RunEvidence:
     jump_px       (n,) how differently from what was seen the poses moved them since the frame before
     overlap       (n,) of silhouette and mask, through (n,) the share of the surface behind which depth was measured
     on_surface    (n,) the share of the surface on which it was measured
+    moved         (n,) bool: by an offline pass, more than three sigmas from the causal pose
     doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
     """
@@ -67,6 +68,7 @@ class RunEvidence:
     overlap: np.ndarray
     through: np.ndarray
     on_surface: np.ndarray
+    moved: np.ndarray
     doubts: tuple[str, ...] = ()
     apart: float = 0.0
 
@@ -162,6 +164,13 @@ _RULES = (
         0.5,
         lambda e: e.on_surface < ON_SURFACE,
         _known("on_surface"),
+    ),
+    _Rule(
+        "moved",
+        "the offline pass moved the pose far, to where it does not fit",
+        0.05,
+        lambda e: e.moved & (e.confidence <= DOUBTED),
+        lambda e: e.has_pose,
     ),
     _Rule(
         "grown",

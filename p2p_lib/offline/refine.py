@@ -7,8 +7,9 @@ without a pose gets one that fits as well as the others do. Causal poses at whic
 kept. The surface is fused anew with half the voxel size.
 
 The confidence of a frame stays the causal one, which judges the causal pose; where the fit gives more, from 1 at no
-cost to 0.5 at the limit, it is that. The rule of causal poses, on the covariance and the points of this pass, tells
-right poses from wrong ones less well: what a pass over all frames has wrong, all frames agree with.
+cost to 0.5 at the limit, it is that. A new pose more than three sigmas from the causal one is doubted where depth does
+not lie on its surface: neither says that it is right. The rule of causal poses, on the covariance and the points of
+this pass, tells right poses from wrong ones less well: what a pass over all frames has wrong, all frames agree with.
 
 Written to ``RUN/offline``, a run's folder of its own that says ``"offline": true``: causal results stay as they are.
 ``<object>/causal`` in its ``poses.npz``, (n,) bool, says in which frames the pose is the causal one that was kept.
@@ -37,6 +38,7 @@ from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.provenance import code_digest
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, read_info, tum_line
+from p2p_lib.evaluation.suspicions import ON_SURFACE
 from p2p_lib.offline import OFFLINE_COMMENT
 from p2p_lib.offline.evidence import VideoEvidence, VideoPoses, gather
 from p2p_lib.offline.finished import Finished
@@ -153,10 +155,14 @@ def _columns(
     for k in np.flatnonzero(stays):
         stays[k] = poses.cost_at(int(k), causal[k]) <= _GROSS * poses.limit
     A = se3.adjoint(se3.inverse(T_new_old))
+    on_volume = T
     T, covariance = T @ T_new_old, A @ covariance @ A.T
     T[stays], covariance[stays] = obj.T_cam_obj[stays], obj.covariance[stays]
     confidence = np.where(stays, obj.confidence, confidence)
     confidence = np.where(has, np.minimum(confidence, 1), 0.0)
+    for k in np.flatnonzero(disagreement(obj, T) > _CHI2_6) if check is not None else ():
+        if check.on_surface(int(k), on_volume[k]) < ON_SURFACE:
+            confidence[k] = min(confidence[k], DOUBTED)
     return {"T_cam_obj": T, "covariance": covariance, "confidence": confidence, CAUSAL: stays}, has & fits
 
 
@@ -191,11 +197,11 @@ def _merged(obj: ObjectRun, part: dict[str, np.ndarray]) -> ObjectRun:
     return replace(obj, **part, **one_map, status=status.astype(str), reason=reason.astype(str))
 
 
-def disagreement(causal: ObjectRun, offline: ObjectRun) -> np.ndarray:
-    """(n,) squared Mahalanobis distance of the two poses by the causal covariance; NaN where one is missing."""
-    both = causal.has_pose & offline.has_pose & np.isfinite(causal.covariance).all((1, 2))
+def disagreement(causal: ObjectRun, T_cam_obj: np.ndarray) -> np.ndarray:
+    """(n,) squared Mahalanobis distances of poses (n, 4, 4) to causal ones, by their covariance; NaN without one."""
+    both = causal.has_pose & np.isfinite(T_cam_obj).all((1, 2)) & np.isfinite(causal.covariance).all((1, 2))
     squared = np.full(len(causal), np.nan)
-    xi = se3.log(se3.inverse(causal.T_cam_obj[both]) @ offline.T_cam_obj[both])
+    xi = se3.log(se3.inverse(causal.T_cam_obj[both]) @ T_cam_obj[both])
     squared[both] = np.einsum("ni,nij,nj->n", xi, np.linalg.pinv(causal.covariance[both]), xi)
     return squared
 
@@ -218,7 +224,7 @@ def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
         has = offline.has_pose
         lines = map(tum_line, offline.time_s[has].tolist(), offline.T_cam_obj[has])
         replace_text(new / "poses" / f"{name}.txt", "".join([OFFLINE_COMMENT] * bool(has.any()) + list(lines)))
-        off = np.flatnonzero(disagreement(obj, offline) > _CHI2_6)
+        off = np.flatnonzero(disagreement(obj, offline.T_cam_obj) > _CHI2_6)
         disagrees[name] = [int(obj.frame_index[k]) for k in off]
         told = f", {int(kept.sum())} of them the causal one, {len(off)} more than three sigmas from it"
         summary.append(f"{name}: {_in_words(obj, offline)}{told}{in_ranges(disagrees[name])}")

@@ -96,9 +96,16 @@ class SurfaceCheck:
 
     def overlap(self, k: int, T: np.ndarray) -> float:
         """IoU of what shows of the surface at a pose with the mask of the k-th frame."""
+        return self._agreement(k, T)[0]
+
+    def on_surface(self, k: int, T: np.ndarray) -> float:
+        """The share of the surface in view at a pose on which depth was measured in the k-th frame; NaN without any."""
+        return self._agreement(k, T)[1]
+
+    def _agreement(self, k: int, T: np.ndarray) -> tuple[float, float, float]:
         frame, silhouette = self._frame(k), self._render(se3.orthonormalised(T))
-        mask = self._made.masks(frame.index)[self._name]
-        return agreement(silhouette, visible(silhouette, frame.depth_m), frame.depth_m, mask)[0]
+        mask = self._made.masks(frame.index).get(self._name)
+        return agreement(silhouette, visible(silhouette, frame.depth_m), frame.depth_m, mask)
 
     def _look(self, frame: Frame, T: np.ndarray, wide: bool = False) -> _Look | None:
         """What a frame shows where a pose has the surface; None with too few pixels on it."""

@@ -192,7 +192,7 @@ def test_misfit_of_registered_depth_is_none():
 def test_what_cannot_be_told_is_not_fine(good, monkeypatch):
     monkeypatch.setattr(check, "misfit", lambda *_: None)
     finding = found(good, "registration")
-    assert finding.level is Level.OPTIONAL and "too few edges" in finding.text
+    assert finding.level is Level.OPTIONAL and "too few edges" in finding.text and "aligns" in finding.fix
 
 
 @pytest.mark.parametrize("frame", [0, 500])

@@ -16,7 +16,7 @@ def spotless() -> RunEvidence:
     numbers = {"mask_px": 5000, "size_m": 0.15, "keypoints": 40, "inside": 1, "off_px": 0.5, "jump_px": 0.2}
     numbers |= {"overlap": 0.9, "through": 0.01, "on_surface": 0.8, "confidence": 0.9}
     numbers = {key: value * full for key, value in numbers.items()}
-    return RunEvidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, **numbers)
+    return RunEvidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, moved=full < 0, **numbers)
 
 
 def with_some(e: RunEvidence, share: float, **wrong: float) -> RunEvidence:
@@ -36,6 +36,7 @@ WRONG = {
     "silhouette": ({"overlap": 0.3}, 0.1, 0.3),
     "seen through": ({"through": 0.3}, 0.4, 0.6),
     "off the surface": ({"on_surface": 0.5}, 0.4, 0.6),
+    "moved": ({"moved": True, "confidence": 0.5}, 0.03, 0.1),
     "grown": ({"size_m": 0.25}, 0.03, 0.1),
     "size": ({"size_m": 0.9}, 0.04, 0.6),
 }
@@ -106,6 +107,7 @@ def test_what_is_not_known_is_not_held_against_anybody():
         "has_pose",
         "elsewhere",
         "confidence",
+        "moved",
         "doubts",
         "apart",
     }

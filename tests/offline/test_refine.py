@@ -411,8 +411,7 @@ def test_disagreement_is_measured_by_the_causal_covariance(made):
     obj = made.run.objects["can"]
     covariance = np.tile(np.diag([1e-4] * 3 + [1e-6] * 3), (len(obj), 1, 1))
     causal = replace(obj, covariance=covariance)
-    moved = replace(obj, T_cam_obj=obj.T_cam_obj @ se3.exp(np.array([0, 0, 0, 0.005, 0, 0])))
-    squared = offline.disagreement(causal, moved)
+    squared = offline.disagreement(causal, obj.T_cam_obj @ se3.exp(np.array([0, 0, 0, 0.005, 0, 0])))
     np.testing.assert_allclose(squared[obj.has_pose], 25, rtol=1e-6)  # 5 mm of 1 mm
     assert np.isnan(squared[~obj.has_pose]).all()
     assert offline.in_ranges([3, 4, 5, 9]) == ": frames 3 to 5, 9"
@@ -444,6 +443,21 @@ def test_frames_keep_the_causal_object_frame_and_what_does_not_fit_has_no_pose(m
     refined = offline._merged(obj, columns)
     assert refined.status[3] == "lost" and set(refined.status[~has]) == {"recovered"}
     assert (refined.status[4:8] == obj.status[4:8]).all()
+
+
+@pytest.mark.parametrize("share", [0.4, 0.8])
+def test_a_pose_moved_far_is_doubted_where_depth_does_not_lie_on_its_surface(made, share):
+    obj = made.run.objects["box"]
+    obj = replace(obj, covariance=np.tile(1e-6 * np.eye(6), (len(obj), 1, 1)))
+    far = np.flatnonzero(obj.has_pose & (obj.confidence > 0.6))[-3:]
+    T = obj.T_cam_obj.copy()
+    T[far] = T[far] @ se3.exp(np.array([0, 0, 0, 0.03, 0, 0]))
+    poses = SimpleNamespace(T=T, covariance=obj.covariance, cost=np.full(len(obj), 0.5), limit=0.5)
+    check = SimpleNamespace(overlap=lambda k, T: 1.0, on_surface=lambda k, T: share)
+    columns, _ = offline._columns(obj, poses, evidence.VideoEvidence(mask_px=[900] * len(obj)), check)
+    before = np.where(obj.has_pose, np.maximum(obj.confidence, 0.5), 0)
+    doubted = np.isin(np.arange(len(obj)), far) & (share < 0.6)
+    np.testing.assert_allclose(columns["confidence"], np.where(doubted, 0.5, before))
 
 
 @pytest.mark.parametrize("what", ["as it is", "darker", "behind", "colours", "pattern"])
