@@ -160,9 +160,10 @@ def _columns(
     T[stays], covariance[stays] = obj.T_cam_obj[stays], obj.covariance[stays]
     confidence = np.where(stays, obj.confidence, confidence)
     confidence = np.where(has, np.minimum(confidence, 1), 0.0)
-    for k in np.flatnonzero(disagreement(obj, T) > _CHI2_6) if check is not None else ():
-        if check.on_surface(int(k), on_volume[k]) < ON_SURFACE:
-            confidence[k] = min(confidence[k], DOUBTED)
+    if check is not None:
+        for k in np.flatnonzero(disagreement(obj, T) > _CHI2_6):
+            if check.on_surface(int(k), on_volume[k]) < ON_SURFACE:
+                confidence[k] = min(confidence[k], DOUBTED)
     return {"T_cam_obj": T, "covariance": covariance, "confidence": confidence, CAUSAL: stays}, has & fits
 
 
