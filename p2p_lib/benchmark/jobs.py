@@ -260,6 +260,8 @@ def _files_hash(job: Job) -> str:
 def _check_start(job: Job, sequence: Sequence) -> None:
     """That the sequence has what the method starts from; :class:`MissingData` says what to put where."""
     name, by = job.sequence.name, RunOptions(masks=job.method.masks).mask_source().name
+    if not sequence.truth:
+        raise MissingData(f"{name}: truth", "there is none, so nothing could be scored", "Track it with p2p run.")
     if prompts := job.prompts:
         if unknown := sorted({prompt.name for prompt in prompts} - set(sequence.objects)) if sequence.truth else ():
             expected = f"the sequence's own names: {', '.join(sequence.objects)}"
@@ -270,7 +272,8 @@ def _check_start(job: Job, sequence: Sequence) -> None:
         if by != "clicks":
             raise MissingData(f"{name}: masks", "there are none", 'Methods with masks = "clicks" need none.')
         if not places:
-            raise MissingData(f"{name}: masks", "none to draw clicks from", "Prompts are kept by names, not paths.")
+            fix = "Clicks are kept by name: give its path below $P2P_DATA, and clicks in $P2P_DATA/prompts/NAME.json."
+            raise MissingData(f"{name}: masks", "none to draw clicks from", fix)
         fix = f"Make it once: p2p click {name} --out {places[0]}"
         raise MissingData(str(places[0]), "no such file, and the sequence has no masks to draw clicks from", fix)
     # Some copies have masks of the first frames alone.

@@ -193,17 +193,22 @@ def _pixels(what: str, given: Any) -> np.ndarray:
     if len(at) > MOST_CLICKS:
         raise BadInput(what, f"{len(at)} of them", f"at most {MOST_CLICKS}", "Give a mask.")
     if at.size and (at.ndim != 2 or at.shape[1] != 2 or not np.isfinite(at).all()):
-        raise BadInput(what, repr(given)[:60], "at least one [x, y] in pixels")
+        raise BadInput(what, repr(given)[:60], "at least one [x, y] in pixels: [[x, y], ...]")
     return at.reshape(-1, 2)
 
 
 def _mask(what: str, given: Any) -> np.ndarray:
     """A mask as bool, of any shape; a copy."""
+    expected = "(H, W) bool: the object's pixels"
     try:
         mask = np.asarray(given)
-        return mask.copy() if mask.dtype == bool else mask > 0
+        on = mask.copy() if mask.dtype == bool else mask > 0
     except (TypeError, ValueError):
-        raise BadInput(what, repr(given)[:60], "(H, W) bool: the object's pixels") from None
+        raise BadInput(what, repr(given)[:60], expected) from None
+    if mask.dtype != bool and on.any() and (least := mask[on].min()) != (most := mask[on].max()):
+        fix = "Of probabilities `mask > 0.5`, of a label image `labels == k`."
+        raise BadInput(what, f"values from {least:g} to {most:g}", expected, fix)
+    return on
 
 
 def _box(what: str, given: Any) -> np.ndarray:
