@@ -212,6 +212,15 @@ def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path, cap
     assert run_benchmark(tmp_path / "plan.toml", tmp_path / "out", progress=False).counts()["done"] == 4
 
 
+def test_what_has_no_truth_is_not_run_for_nothing(plan, slides, tmp_path):
+    bare = tmp_path / "bare"
+    shutil.copytree(slides[1], bare)
+    shutil.rmtree(bare / "annotated_poses")
+    (tmp_path / "plan.toml").write_text(plan.read_text().replace(str(slides[1]), str(bare)))
+    of_bare = [job for job in jobs_of(read_plan(tmp_path / "plan.toml"), "full") if job.sequence.name == str(bare)]
+    assert of_bare and all(not job.key and "nothing could be scored" in job.reason for job in of_bare)
+
+
 def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp_path):
     def kill_the_first() -> None:
         while not (found := [p for p in multiprocessing.active_children() if p.pid]):
