@@ -22,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 MECHANISMS = ROOT / "benchmarks" / "mechanisms.toml"
 #: What tests need of the project.
-COPIED = ("p2p_lib", "notebooks", "tests", "pyproject.toml")
+COPIED = ("p2p_lib", "data_manifests", "notebooks", "tests", "pyproject.toml")
 PASSED, FAILED = 0, 1
 
 

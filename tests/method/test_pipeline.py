@@ -711,9 +711,9 @@ def test_refusals_name_what_came_and_what_is_known():
     with pytest.raises(BadInput, match=r"mask of 'right': got 10x10, expected 400x300"):
         method.add_object("right", mask=np.ones((10, 10), bool))
     likely = np.where(masks["left"], 0.9, 0.1)
-    with pytest.raises(BadInput, match=r"mask of 'left': got values from 0.1 to 0.9, expected .* mask > 0.5"):
+    with pytest.raises(BadInput, match=r"mask of 'left': got values from 0.1 to 0.9, expected .*mask > 0.5"):
         method.step(frame, {"left": likely})
-    with pytest.raises(BadInput, match=r"got values from 1 to 2, expected .* labels == k"):
+    with pytest.raises(BadInput, match=r"got values from 1 to 2, expected .*labels == k"):
         method.add_object("right", mask=masks["left"] + 2 * masks["right"].astype(np.uint8))
     np.testing.assert_array_equal(Prompt("left", 0, mask=255 * masks["left"].astype(np.uint8)).mask, masks["left"])
     small = Frame(3, 0.0, frame.rgb[:200, :300], frame.depth_m[:200, :300])
