@@ -389,8 +389,8 @@ def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Calla
                 bar.update()
             if not writer.begun:
                 writer.begin()  # all frames were on disk, the maps were not
-        except KeyboardInterrupt:
-            writer.info["stopped_by"] = "KeyboardInterrupt"
+        except KeyboardInterrupt as interrupt:
+            writer.info["stopped_by"] = type(interrupt).__name__
             writer.keep_whole_frames()
     if writer.begun:
         keeper.save_maps()

@@ -102,11 +102,12 @@ class Browser:
 
     def figures(self, page: Path, wait_ms: int = 10_000) -> list[dict]:
         """Each picture, film and inner page as the browser has it: kind, width, height, shown_px (0: none), alt."""
-        return self._probed(page, wait_ms)["found"]
+        return self.seen(page, 1280, wait_ms)[0]
 
-    def wider_than(self, page: Path, width_px: int) -> list[str]:
-        """The tables, drawings and equations that reach beyond a window of this width."""
-        return self._probed(page, 1000, f"--window-size={width_px},900")["wide"]
+    def seen(self, page: Path, width_px: int, wait_ms: int = 10_000) -> tuple[list[dict], list[str]]:
+        """In a window of this width: those, and the tables, drawings and equations that reach beyond it."""
+        told = self._probed(page, wait_ms, f"--window-size={width_px},900")
+        return told["found"], told["wide"]
 
     def _probed(self, page: Path, wait_ms: int, *more: str) -> dict:
         text, probe = page.read_text(encoding="utf-8"), page.with_name(f"{page.stem}.probe.html")

@@ -91,6 +91,10 @@ def command(name: str, help: str, *arguments: Argument) -> Callable:
     return declare
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM ends a command as Ctrl-C does: what is done so far is kept."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code (0 fine, 2 something to mend, 130 interrupted)."""
     for library in ("OMP", "OPENBLAS", "MKL"):
@@ -106,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def terminated(number: int, frame: object) -> None:
         ended_by.append(signal.Signals(number))
-        raise KeyboardInterrupt  # SIGTERM ends a command as Ctrl-C does: what is done so far is kept
+        raise Terminated
 
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, terminated) if in_main else None

@@ -16,7 +16,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from p2p_lib.core.errors import BadInput, MissingBackend, did_you_mean, in_a_line
+from p2p_lib.core.errors import BadInput, MissingBackend, did_you_mean, doubt, in_a_line
 
 #: What users call a kind where that is another word: --format.
 _SAID = {"dataset": "format"}
@@ -59,6 +59,9 @@ def find(kind: str, name: str, known: Mapping[str, str]) -> Callable[..., Any]:
     that cannot be called as its kind is (:data:`CALLED_WITH`); :class:`MissingBackend` says why it cannot be loaded.
     """
     if name in known:
+        if name in offered(kind):
+            place = offered(kind)[name].value
+            doubt(f"{_SAID.get(kind, kind)} {name!r}", f"ours is used, not {place}", f"Name that one {place}.")
         return load(known[name])
     if is_place(name):
         with _working_folder_first():

@@ -17,6 +17,8 @@ from p2p_lib.core.types import Frame
 
 #: Clicks of one kind on an object in a frame.
 MOST_CLICKS = 1000
+#: Of the pixels of two masks so many in both: they are of one object.
+_ONE_OBJECT = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +99,17 @@ def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
 
 
 def check_apart(others: Iterable[Prompt], prompt: Prompt, where: str = "") -> None:
-    """Refuse a click that is also one of another object's in the same frame, or on its mask; ``where`` as above."""
+    """Refuse a click that is also another object's in the same frame, or on its mask, and a mask that is another's.
+
+    ``where`` as above.
+    """
     for other in others:
         check_not_on(prompt, other, where)
+        if prompt.mask is not None and other.mask is not None and other.name != prompt.name:
+            both, either = (prompt.mask & other.mask).sum(), (prompt.mask | other.mask).sum()
+            if both > _ONE_OBJECT * either:
+                got = f"{both} of its {prompt.mask.sum()} pixels are also of {other.name!r}{where}"
+                raise BadInput(f"mask of {prompt.name!r}", got, "another object's pixels", "Leave one of them out.")
         if _meet(other.points_px, prompt.points_px):
             got = f"a click that is also one of {other.name!r}"
             raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel that belongs to one object only")

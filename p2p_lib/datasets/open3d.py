@@ -32,7 +32,8 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     if path is None:
         fix = "Open3D's recorder writes it beside color/."
         fix = "Rename color/ to rgb/: cam_K.txt is read beside that." if (folder / "cam_K.txt").is_file() else fix
-        raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}", fix)
+        fix += " If it is of another layout, name that with --format."
+        raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}, as Open3D's layout (color/) has", fix)
     # It is written column by column.
     K = np.array(read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it").intrinsic_matrix).reshape(3, 3).T
     files = ImageSequence(folder, rgb, depth, camera_for(rgb, K, str(path)), images.frame_times(folder, rgb))

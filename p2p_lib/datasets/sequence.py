@@ -27,11 +27,13 @@ FORMATS: dict[str, tuple[str, ...]] = {
     "ho3d": ("meta/*.pkl",),
     "bop": ("scene_camera.json",),
     "tum": ("rgb.txt",),
-    "open3d": ("color/",),
     "ycbmultitrack": ("annotated_poses/*/",),
     "ycbineoat": ("gt_mask/", "annotated_poses/*.txt"),
+    "open3d": ("color/",),
     "folder": ("rgb/",),
 }
+#: Of these a folder shows no more than where its colour images are: layouts of others are tried before them.
+_PLAIN = ("open3d", "folder")
 
 #: What a file is that may be given where a folder is meant.
 RECORDINGS = {
@@ -139,7 +141,7 @@ def open_sequence(
     Datasets are known by their manifests: ``mustard0``, or ``ycbineoat/mustard0`` where two datasets have one; any
     other folder by its path below ``$P2P_DATA``.
 
-    format       one of :data:`FORMATS`, or somebody else's; by default the layout is recognised, ours before others
+    format       one of :data:`FORMATS`, or somebody else's; by default the layout is recognised
     depth_scale  metres per raw unit of the depth images (default: the layout's, mostly 0.001 for millimetres)
     seed         of a synthetic scene whose name has none (default 0)
     masks        another folder of masks (a name inside the sequence, or a path); by default the dataset's own
@@ -255,13 +257,12 @@ def recognise(folder: Path) -> str:
 
 
 def _layout(folder: Path) -> str | None:
-    """By patterns; those of others are tried before the last of ours, which takes almost everything."""
+    """By patterns; those of others are tried before the plain ones of ours, which take almost everything."""
 
     def tried() -> Iterator[tuple[str, tuple[str, ...]]]:
-        *ours, last = FORMATS.items()
-        yield from ours
+        yield from ((name, patterns) for name, patterns in FORMATS.items() if name not in _PLAIN)
         yield from ((name, getattr(_loader(name), "patterns", ())) for name in offered("dataset"))
-        yield last
+        yield from ((name, FORMATS[name]) for name in _PLAIN)
 
     return next((name for name, patterns in tried() if any(next(folder.glob(p), None) for p in patterns)), None)
 

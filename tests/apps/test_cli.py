@@ -1191,7 +1191,8 @@ def test_signals(how, code, long, tmp_path):
     frames, timed = len(loaded.objects["object"]), len(loaded.timings["total_ms"])
     assert loaded.info["finished"] is False
     assert 10 <= frames == timed < 600 if code > 0 else 1 <= frames <= timed < 600
-    assert load_run(out).info["stopped_by"] == ("KeyboardInterrupt" if code > 0 else None)
+    stopped_by = {signal.SIGINT: "KeyboardInterrupt", signal.SIGTERM: "Terminated", signal.SIGKILL: None}
+    assert load_run(out).info["stopped_by"] == stopped_by[how]
 
 
 def test_as_a_process(tmp_path):

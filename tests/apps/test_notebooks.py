@@ -202,10 +202,10 @@ def test_a_browser_shows_every_figure_of_the_gallery(suite_out, browser):
         made = sum(
             "image/png" in data or bool(re.search("<(video|iframe)", data.get("text/html", ""))) for data in outputs
         )
-        figures = browser.figures(page)
+        figures, wide = browser.seen(page, 1280)
         assert len(figures) == made > 0, page.name
         assert [f for f in figures if f["kind"] == "IMG" and len(f["alt"]) < 30] == [], f"{page.name}: no words for it"
-        assert browser.wider_than(page, 1280) == [], page.name
+        assert wide == [], page.name
         thumbnails += figures
     assert [f for f in thumbnails if min(f["width"], f["height"], f["shown_px"]) < 20] == []
 

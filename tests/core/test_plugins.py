@@ -11,11 +11,11 @@ from p2p_lib.core import plugins
 from p2p_lib.core.backends import make_detector, make_segmenter, make_tracker
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.errors import BadInput, Doubt, MissingBackend
 from p2p_lib.core.options import RunOptions
 from p2p_lib.datasets.cameras import open_camera
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.datasets.sequence import open_sequence, recognise
 from tests.apps.test_cli import POINTS_ALONE
 from tests.fixtures.sliding_board import write_sequence
 
@@ -133,7 +133,10 @@ def test_a_layout_of_others_is_recognised_or_named(theirs, sequence):
     (sequence / "gt_mask").rename(sequence / "gt_mask.marked")
     assert open_sequence(sequence).format == "ycbineoat", "ours come first"
     shutil.rmtree(sequence / "annotated_poses")
-    assert open_sequence(sequence).format == "marked", "but for the one that takes everything"
+    assert open_sequence(sequence).format == "marked", "but for those of a mere folder of colour images"
+    (sequence / "rgb").rename(sequence / "color")
+    assert recognise(sequence) == "marked"
+    (sequence / "color").rename(sequence / "rgb")
     for name in ("marked", "their_parts:load"):
         assert open_sequence(sequence, format=name).format == name
 
@@ -157,7 +160,9 @@ def test_what_is_installed_is_read_once(monkeypatch):
 
 
 def test_our_names_stay_ours(theirs):
-    assert type(make_tracker("builtin", preset().tracking)).__module__.startswith("p2p_lib.")
+    with pytest.warns(Doubt, match=r"tracker 'builtin': ours is used, not their_parts:Mine\. Name that"):
+        made = make_tracker("builtin", preset().tracking)
+    assert type(made).__module__.startswith("p2p_lib.")
 
 
 def test_what_cannot_be_had_is_said_in_one_line(theirs, sequence):

@@ -121,7 +121,7 @@ def test_open3ds_recordings_are_read_as_open3d_reads_them(tmp_path):
     assert open_sequence(folder).format == "open3d"
     same(open_sequence(folder))
     (folder / "camera_intrinsic.json").unlink()
-    with pytest.raises(MissingData, match=r"no camera_intrinsic\.json or intrinsic\.json"):
+    with pytest.raises(MissingData, match=r"intrinsic\.json, as Open3D's layout .*name that with --format"):
         open_sequence(folder)
 
 

@@ -878,6 +878,10 @@ def test_clicks_that_do_not_fit_are_refused_and_leave_no_object_behind():
     method.add_object("left", clicks=good)
     with pytest.raises(BadInput, match="clicks on 'cup': got a click that is also one of 'left'"):
         method.add_object("cup", clicks=[good[1] + 0.2, [10, 10]])
+    method.add_object("held", mask=masks["right"])
+    with pytest.raises(BadInput, match=r"mask of 'cup': got .* pixels are also of 'held'"):
+        method.add_object("cup", mask=masks["right"] & (np.indices(masks["right"].shape)[1] % 20 > 0))
+    method.remove_object("held")
     with pytest.raises(BadInput, match="mask of 'cup': got the whole image"):
         method.add_object("cup", mask=np.ones((300, 400), bool))
     with pytest.raises(BadInput, match=r"box around 'cup': got \[500.0, .*, expected a box within 400x300"):
