@@ -242,7 +242,10 @@ def _camera(camera: Camera) -> Finding:
 
 
 def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Camera) -> Finding:
-    """Whether what a mask holds is as long as the object is known to be."""
+    """Whether what a mask holds is as long as the object is known to be; a mask that is cut off tells nothing."""
+    if mask[[0, -1]].any() or mask[:, [0, -1]].any():
+        text = f"{100 * known_m:g} cm given; its mask in frame {frame.index} reaches the image's border"
+        return Finding(f"{name}: size", Level.OPTIONAL, text, "p2p run --size measures it in every frame.")
     of = Lengths(known_m, measured_m := mask_length_m(frame, mask, camera))
     if text := of.doubt:
         return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")

@@ -40,6 +40,8 @@ from p2p_lib.run import described, recall
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4
+#: Before this frame the first masks were made, which takes longer than later frames.
+_SECOND = 2
 
 
 @dataclass
@@ -146,6 +148,8 @@ def track_live(
             tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
+                if count.frames == _SECOND and count.dropped:
+                    say(f"{count.dropped} images came while the first masks were made, and were dropped")
             count.seconds = monotonic() - start_s
             frame = newest.take()
         if newest.stopped and options.stop is not None:

@@ -26,6 +26,8 @@ DEFAULT_HZ = 30.0
 _UNDECODED: tuple[type[Exception], ...] = (*UNREADABLE, cv2.error)
 #: What to do about a frame that cannot be read, where nobody can mend it.
 SKIP_BAD = "p2p run --skip-bad goes on without such frames."
+#: Numbers of two images that belong together go on alike, to this share of a step.
+_OUT_OF_STEP = 0.75
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.
 NOT_RIGID = 0.01
 
@@ -93,13 +95,33 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in parts] + [(0, path.name)]
 
 
+def _check_in_step(files: tuple[Path, ...], reference: tuple[Path, ...]) -> None:
+    """Refuse pairs whose numbers, the last ones in their names, count images or time alike but for a jump."""
+    found = [[re.findall(r"\d+", path.stem) for path in paths] for paths in (files, reference)]
+    if len(files) < 3 or not all(numbers for of in found for numbers in of):
+        return
+    own, other = (np.array([float(numbers[-1]) for numbers in of]) for of in found)
+    step, other_step = np.median(np.diff(own)), np.median(np.diff(other))
+    if not 0 < step <= 2 * other_step or not other_step <= 2 * step:
+        return  # they count something else
+    jumps = np.flatnonzero(np.abs(np.diff(own - other)) > _OUT_OF_STEP * step)
+    if len(jumps):
+        k = int(jumps[0])
+        got = f"{files[k].name} with {reference[k].name}, and next {files[k + 1].name} with {reference[k + 1].name}"
+        expected = f"one for each in {reference[0].parent}, with numbers that keep their distance"
+        raise BadInput(str(files[0].parent), got, expected, "Take out what has no counterpart.")
+
+
 def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str = "") -> tuple[Path, ...]:
     """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order.
 
-    Where most are called alike, all have to be: else one is missing here and one there, and those between are shifted.
+    Where most are called alike, all have to be, and where none is, the numbers in their names have to keep their
+    distance: else one is missing here and one there, and those between are shifted.
     """
     stems, wanted = {p.stem for p in files}, {p.stem for p in reference}
     if len(files) == len(reference):
+        if not stems & wanted:
+            _check_in_step(files, reference)
         if not len(reference) > len(stems & wanted) >= len(reference) / 2:
             return files
         got = f"no {min(wanted - stems)}{files[0].suffix}, and {min(stems - wanted)}{files[0].suffix} instead"

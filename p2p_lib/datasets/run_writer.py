@@ -251,7 +251,6 @@ class RunWriter:
                 info["prompts"] = [prompt for prompt in info.get("prompts") or [] if prompt["frame"] < start]
                 info["options"] = {**(info.get("options") or {}), "prompts": None}
             theirs["objects"] = mine["objects"]  # their poses tell
-            fix = "Say --from FRAME of the first change." if mine["prompts"] != theirs["prompts"] else fix
         differ = [key for key in mine if theirs[key] != mine[key] and key not in _MAY_DIFFER]
         if not differ and parameters:
             return
@@ -262,6 +261,10 @@ class RunWriter:
             raise BadInput(f"{self.path}: the run to go on with", now, f"{was}, as it began", fix)
         if not differ:
             raise BadInput(str(self.path / "config.toml"), "other parameters", "those that it began with", fix)
+        if differ == ["prompts"] and start is not None:
+            now, was = (_not_in(*both) for both in ((mine, theirs), (theirs, mine)))
+            fix = f"Keep what is said before frame {start} as it was, or say --from FRAME of the first change."
+            raise BadInput(f"{self.path}: prompts", now or "nothing", f"{was or 'none'}, as it began", fix)
         got, expected = (", ".join(str(info[key])[:80] for key in differ) for info in (mine, theirs))
         raise BadInput(f"{self.path}: {', '.join(differ)}", got, f"{expected}, as it began", fix)
 
@@ -335,6 +338,12 @@ def _in_words(info: Mapping[str, Any]) -> str:
 
 def _place(info: Mapping[str, Any]) -> str:
     return info["path"] or info["sequence"]
+
+
+def _not_in(info: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """The prompts of one run that another does not have, in words."""
+    alone = [prompt for prompt in info["prompts"] if prompt not in other["prompts"]]
+    return ", ".join(f"what is said of {prompt['name']!r} in frame {prompt['frame']}" for prompt in alone)
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:

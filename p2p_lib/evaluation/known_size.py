@@ -38,7 +38,7 @@ class Lengths:
     @property
     def doubt(self) -> str:
         """What speaks against the known length, in words; "" where nothing does."""
-        least_m, most_m = SHORTER * self.known_m, LONGER * self.known_m + SLACK_M
+        least_m, most_m = self._range_m
         off = [m / self.known_m for m in self._measured.values() if not least_m <= m <= most_m]
         if not off or (len(off) < len(self._measured) and min(off) < 1):  # the other has seen all of it
             return ""
@@ -54,7 +54,13 @@ class Lengths:
         """That it is measured as long as it is known to be, in words; "" where it is not, or not measured."""
         if self.doubt or not self._measured:
             return ""
-        return f"measured {self._found}, {100 * self.known_m:g} cm given: fits"
+        least_m, most_m = self._range_m
+        given = f"{100 * self.known_m:g} cm given"
+        return f"measured {self._found}, {given}: fits, as {100 * least_m:.0f} to {100 * most_m:.0f} cm would"
+
+    @property
+    def _range_m(self) -> tuple[float, float]:
+        return SHORTER * self.known_m, LONGER * self.known_m + SLACK_M
 
     @property
     def _measured(self) -> dict[str, float]:

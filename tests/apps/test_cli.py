@@ -335,13 +335,17 @@ def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsy
     more = [*prompts(hidden), "--save-masks"]
     for words, said in (
         (["--resume"], "out: prompts: got"),
-        (["--resume", "--from", "6"], "Say --from FRAME of the first change"),
+        (["--resume", "--from", "6"], "or say --from FRAME of the first change"),
         (["--resume", "--from", "0"], f"from: got frame 0, expected one from 1 to {FRAMES - 1}"),
         (["--resume", "--from", "5", "--seed", "9"], "got --seed 9, expected no --seed, as it began. Ask for the same"),
     ):
         capsys.readouterr()
         assert run(sequence, out, *more, *words) == 2 and said in one_line(capsys)
+    assert run(sequence, out, *prompts(), "--save-masks", "--resume", "--from", "7") == 2
+    lacks = "prompts: got nothing, expected what is said of 'gone' in frame 6, as it began"
+    assert lacks in one_line(capsys)
     assert contents(out) == before
+    prompts(hidden)
 
     def interrupted(self, frame, masks=None):
         if frame.index == 6:
@@ -515,7 +519,9 @@ def test_a_torn_frame_is_left_out_too_but_not_one_that_a_prompt_is_made_on(seque
 def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, capsys):
     """The board is 60 px wide half a metre away: 15 cm."""
     run(sequence, tmp_path / "run", "--size", "object=15")
-    fits = re.compile(r"^object: measured 1\d\.\d cm in its masks, 15 cm given: fits$", re.MULTILINE)
+    fits = re.compile(
+        r"^object: measured 1\d\.\d cm in its masks, 15 cm given: fits, as 10 to 18 cm would$", re.MULTILINE
+    )
     assert "known to be" not in (out := capsys.readouterr().out) and fits.search(out)
     run(sequence, tmp_path / "other", "--size", "object=7")
     assert re.search(

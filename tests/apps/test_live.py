@@ -338,7 +338,8 @@ def test_live_prints_a_line_per_object_and_frame(folder, tmp_path, capsys):
     out, err = capsys.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
     assert code == 0
-    frames, dropped = map(int, re.fullmatch(r"(\d+) frames in .* s \(.* Hz\), (\d+) dropped\n", err).groups())
+    told = re.fullmatch(r"(\d+) frames in .* s \(.* Hz\), (\d+) dropped", err.splitlines()[-1])
+    frames, dropped = map(int, told.groups())
     assert len(lines) == frames and frames + dropped <= FRAMES
     keys = {
         "time_s",
@@ -706,7 +707,7 @@ def test_whoever_is_to_say_something_is_told_when_and_how(folder, capsys, monkey
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     words = ["live", "--camera", f"folder:{folder}", "--rate", "200", *WORDS]
     assert cli.main([*words, "--listen"]) == 0
-    first, last = capsys.readouterr().err.splitlines()
+    first, *_, last = capsys.readouterr().err.splitlines()
     assert first.startswith("slide runs; objects are told on standard input, a line each: ") and "dropped" in last
     shown = first.partition(": ")[2].partition(" or ")
     said = Words(None, print)
@@ -875,8 +876,20 @@ def test_frames_up_to_the_stop_are_all_counted(folder):
     camera = Scripted(sequence.camera)
     for k in (0, 1, 2, 14):
         camera.hand.put(sequence.frame(k))
-    count = track_live(camera, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS, stop=12))
-    assert (count.frames, count.dropped) == (3, 9)
+    said = []
+    count = track_live(camera, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS, stop=12), say=said.append)
+    assert (count.frames, count.dropped) == (3, 9) and not [line for line in said if "first masks" in line]
+
+
+def test_what_was_dropped_while_the_first_masks_were_made_is_said(folder):
+    sequence, said = open_sequence(folder), []
+    camera = Scripted(sequence.camera)
+    for k in (0, 5, 7):
+        camera.hand.put(sequence.frame(k))
+    camera.hand.put(None)
+    count = track_live(camera, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS), say=said.append)
+    assert (count.frames, count.dropped) == (3, 5)
+    assert said[-1] == "4 images came while the first masks were made, and were dropped"
 
 
 class AtOnce(Scripted):

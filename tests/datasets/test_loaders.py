@@ -185,6 +185,31 @@ def test_images_of_other_names_between_are_not_paired_by_their_number(sequence):
     read_all(sequence)
 
 
+@pytest.mark.parametrize("stamped", [False, True], ids=["numbers", "times"])
+def test_images_of_unlike_names_are_paired_while_their_numbers_go_on_alike(sequence, stamped):
+    """As many of each, but one is missing here and one there: all between would be of another moment."""
+    times = [1581120424100262102 + 33_000_000 * i for i in range(9)] if stamped else list(range(9))
+    rgb, depth = (sorted((sequence / part).iterdir())[0].read_bytes() for part in ("rgb", "depth"))
+    for part in ("masks", "annotated_poses", "is_mask_visible"):
+        shutil.rmtree(sequence / part)
+
+    def written(of_rgb, of_depth):
+        for part, image, numbers in (("rgb", rgb, of_rgb), ("depth", depth, of_depth)):
+            shutil.rmtree(sequence / part)
+            (sequence / part).mkdir()
+            for k in numbers:
+                put(sequence / part / f"{part}_{k:020d}.png", image)
+
+    late = [t + 4_000_000 if stamped else t + 1 for t in times]
+    written(times[:3] + times[4:], late[:3] + late[4:])
+    assert len(open_sequence(sequence).rgb) == 8, "both lack the same one"
+    written(times, [20_000 + 7 * i for i in range(9)] if stamped else [10 * i for i in range(9)])
+    assert len(open_sequence(sequence).rgb) == 9, "they count something else"
+    written(times[:3] + times[4:], late[:6] + late[7:])
+    said = rf"depth: got depth_0*{late[2]}\.png with rgb_0*{times[2]}\.png, and next depth_0*{late[3]}\.png with rgb_0*"
+    assert_named(sequence, rf"{said}{times[4]}\.png, expected .*keep their distance. Take out")
+
+
 def test_a_camera_matrix_may_stand_in_one_line(sequence):
     put(sequence / "cam_K.txt", "50 0 20 0 51 15 0 0 1")
     camera = open_sequence(sequence).camera
