@@ -374,7 +374,8 @@ def test_without_truth_there_is_no_score_and_no_fuss(sequence, tmp_path, capsys)
     shutil.rmtree(sequence / "annotated_poses")
     assert run(sequence, tmp_path / "out") == 0
     out, err = capsys.readouterr()
-    assert "ADD" not in out and err == ""
+    said = f"nothing speaks against it; p2p eval {tmp_path / 'out'} looks at all"
+    assert "ADD" not in out and err == "" and said in out
     assert cli.main(["eval", str(tmp_path / "out"), "--json"]) == 0
     out, err = capsys.readouterr()
     said = json.loads(out)
