@@ -19,11 +19,13 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.raycasting import ray_scene
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.alignment import background_share, rim
 from p2p_lib.datasets.models import MESHES, find_models
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence as Recording
+from p2p_lib.evaluation.evidence import drawn_m, on_surface
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import WIDTH_IN, panels
@@ -175,6 +177,30 @@ def masks_image(frame: Frame, masks: Mapping[str, np.ndarray], width_px: int = 4
     images = [mask_image(frame, mask, title, width_px) for title, mask in masks.items()]
     height_px = min(image.shape[0] for image in images)
     return overlay.montage([image[:height_px] for image in images], columns=len(images))
+
+
+def surface_fit(
+    sequence: Recording,
+    run: Run,
+    meshes: Mapping[str, Any],
+    rows: Iterable[int],
+    T_obj_wrong: np.ndarray = se3.IDENTITY,
+) -> dict[str, Series]:
+    """Per object, at these rows with a pose: the fraction of its unhidden surface on which depth was measured.
+
+    meshes       object to its reconstructed surface: anything with ``vertices`` (V, 3) in its frame and ``faces``
+    T_obj_wrong  (4, 4) by which all poses are put off on purpose, to see what a wrong pose would look like
+    """
+    found: dict[str, dict[int, float]] = {name: {} for name in meshes}
+    scenes = {name: ray_scene(mesh.vertices, mesh.faces) for name, mesh in meshes.items()}
+    for row in rows:
+        frame = sequence.frame(int(next(iter(run.objects.values())).frame_index[row]))
+        for name, scene in scenes.items():
+            obj = run.objects[name]
+            if obj.has_pose[row]:
+                surface_m = drawn_m(scene, sequence.camera, obj.T_cam_obj[row] @ T_obj_wrong)
+                found[name][row] = on_surface(surface_m, frame.depth_m)
+    return {name: Series(fits, dtype=float) for name, fits in found.items()}
 
 
 @style.styled

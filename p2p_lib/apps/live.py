@@ -40,8 +40,6 @@ from p2p_lib.run import described, recall
 
 #: Made-up images that are tracked before a camera starts.
 _WARM_FRAMES = 4
-#: Before this frame the first masks were made, which takes longer than later frames.
-_SECOND = 2
 
 
 @dataclass
@@ -148,7 +146,7 @@ def track_live(
             tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
-                if count.frames == _SECOND and count.dropped:
+                if count.frames == 2 and count.dropped:  # the first frame took as long as first masks do
                     say(f"{count.dropped} images came while the first masks were made, and were dropped")
             count.seconds = monotonic() - start_s
             frame = newest.take()

@@ -109,8 +109,6 @@ def _run(a: argparse.Namespace) -> int:
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
         print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
-    elif result.tracked and result.evaluation is None:
-        print(f"By some of the images nothing speaks against it; p2p eval {a.out} looks at all.")
     first = a.out / FIRST_MASKS
     results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:

@@ -261,11 +261,12 @@ class RunWriter:
             raise BadInput(f"{self.path}: the run to go on with", now, f"{was}, as it began", fix)
         if not differ:
             raise BadInput(str(self.path / "config.toml"), "other parameters", "those that it began with", fix)
-        if differ == ["prompts"] and start is not None:
-            now, was = (_not_in(*both) for both in ((mine, theirs), (theirs, mine)))
+        if "prompts" in differ and start is not None:
             fix = f"Keep what is said before frame {start} as it was, or say --from FRAME of the first change."
-            raise BadInput(f"{self.path}: prompts", now or "nothing", f"{was or 'none'}, as it began", fix)
-        got, expected = (", ".join(str(info[key])[:80] for key in differ) for info in (mine, theirs))
+        got, expected = (
+            ", ".join(_prompts_alone(*both) if key == "prompts" else str(both[0][key])[:80] for key in differ)
+            for both in ((mine, theirs), (theirs, mine))
+        )
         raise BadInput(f"{self.path}: {', '.join(differ)}", got, f"{expected}, as it began", fix)
 
     def _compare(self, earlier: Run, k: int) -> None:
@@ -340,10 +341,11 @@ def _place(info: Mapping[str, Any]) -> str:
     return info["path"] or info["sequence"]
 
 
-def _not_in(info: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+def _prompts_alone(info: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """The prompts of one run that another does not have, in words."""
-    alone = [prompt for prompt in info["prompts"] if prompt not in other["prompts"]]
-    return ", ".join(f"what is said of {prompt['name']!r} in frame {prompt['frame']}" for prompt in alone)
+    alone = [prompt for prompt in info["prompts"] or [] if prompt not in (other["prompts"] or [])]
+    said = [(p["name"], p["frame"], {key: p[key] for key in p if key not in ("name", "frame")}) for p in alone]
+    return ", ".join(f"{name!r} in frame {frame}: {str(what)[:60]}" for name, frame, what in said) or "nothing"
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:

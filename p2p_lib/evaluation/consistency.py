@@ -8,28 +8,27 @@ suspicious in all this is judged by :mod:`p2p_lib.evaluation.suspicions`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from p2p_lib.core import se3, tables
+from p2p_lib.core import tables
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import P2PError
-from p2p_lib.core.raycasting import ray_scene
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
-from p2p_lib.evaluation.evidence import ON_M, drawn_m, gathered, on_surface, reprojected, surface_in_view
+from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_view
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, median_of_known, suspicions
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
 #: Frames that are looked at, evenly spread over the run.
 LOOKS = 60
@@ -157,32 +156,6 @@ def consistency(
             numbers["reprojection_px"] = _reprojection_px(obj, keypoints[name], sequence.camera)
         objects[name] = numbers
     return Consistency(objects, found, unknown, run.info, rate(run.timings)[0])
-
-
-def surface_fit(
-    sequence: Sequence,
-    run: Run,
-    meshes: Mapping[str, Any],
-    rows: Iterable[int],
-    T_obj_wrong: np.ndarray = se3.IDENTITY,
-) -> dict[str, Series]:
-    """Per object, at these rows with a pose: the fraction of its unhidden surface on which depth was measured.
-
-    meshes       object to its reconstructed surface: anything with ``vertices`` (V, 3) in its frame and ``faces``
-    T_obj_wrong  (4, 4) by which all poses are put off on purpose, to see what a wrong pose would look like
-    """
-    from pandas import Series
-
-    found: dict[str, dict[int, float]] = {name: {} for name in meshes}
-    scenes = {name: ray_scene(mesh.vertices, mesh.faces) for name, mesh in meshes.items()}
-    for row in rows:
-        frame = sequence.frame(int(next(iter(run.objects.values())).frame_index[row]))
-        for name, scene in scenes.items():
-            obj = run.objects[name]
-            if obj.has_pose[row]:
-                surface_m = drawn_m(scene, sequence.camera, obj.T_cam_obj[row] @ T_obj_wrong)
-                found[name][row] = on_surface(surface_m, frame.depth_m)
-    return {name: Series(fits, dtype=float) for name, fits in found.items()}
 
 
 def _is_about(doubt: str, name: str) -> bool:

@@ -19,6 +19,8 @@ from p2p_lib.datasets.mask_log import load_masks
 LONGER, SLACK_M, SHORTER = 1.15, 0.01, 0.7
 #: Points of a surface that are measured, and the share of them at either end that is not: shreds at its rim.
 _POINTS, _SHREDS = 4000, 0.01
+#: By such a factor everything is longer than known where the length was given in metres for centimetres.
+_IN_METRES = 80, 125
 #: A mask shows the whole object at least so often.
 _OFTEN = 0.9
 
@@ -44,7 +46,7 @@ class Lengths:
             return ""
         factor = float(np.median(off))
         text = f"known to be {100 * self.known_m:g} cm long, measured {self._found}, {factor:.2f} times"
-        if 80 < factor < 125:
+        if _IN_METRES[0] < factor < _IN_METRES[1]:
             return f"{text}: sizes are in centimetres, {100 * self.known_m:g} may be metres"
         besides = "its length was never in view" if factor < 1 else "masks hold more than the object"
         return f"{text}: focal length or depth scale is wrong by this factor, or {besides}"

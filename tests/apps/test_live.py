@@ -153,11 +153,11 @@ class Careless(Scripted):
 
     def __init__(self, camera: Camera, waits: bool):
         super().__init__(camera)
-        self.waits, self.reads = waits, 0
+        self.waits, self.reads, self.woken = waits, 0, threading.Event()
 
     def read(self):
         self.reads += 1
-        time.sleep(3600 if self.waits and self.reads == 3 else 0.001)
+        self.woken.wait(3600 if self.waits and self.reads == 3 else 0.001)
         return picture(self.reads)
 
     def close(self):
@@ -175,6 +175,9 @@ def test_a_camera_that_does_not_close_keeps_nobody(scripted, waits, monkeypatch)
             while careless.reads < 3:
                 time.sleep(0.001)
             raise RuntimeError("the user's own")
+    left = [thread.daemon for thread in threading.enumerate() if thread.name == "p2p camera"]
+    careless.woken.set()
+    assert left == [True] * waits, "what is left of it keeps no process"
     found = [str(doubt.message) for doubt in said if doubt.category is Doubt]
     assert len(found) == waits and all(
         "camera scripted: still in read(), 0.3 s after close()" in text for text in found

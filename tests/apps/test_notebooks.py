@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
+from p2p_lib.apps import cli
+from p2p_lib.core import compiled
 from p2p_lib.core.errors import BadInput, MissingData
 from studies import runner
 from studies.claims import Claim, check
@@ -220,6 +222,14 @@ def test_the_browser_sees_what_is_not_shown(tmp_path, browser):
 
 
 # The runner
+
+
+def test_loops_are_compiled_before_the_first_kernel_starts(monkeypatch):
+    did = []
+    monkeypatch.setattr(compiled, "warm_up", lambda say: did.append("compiled"))
+    monkeypatch.setattr(runner, "run_notebooks", lambda profile, **how: did.append(how["only"]))
+    assert cli.main(["notebooks", "--only", "03"]) == 0
+    assert did == ["compiled", ("03",)] or did == ["compiled", ["03"]]
 
 
 @pytest.fixture(scope="module")

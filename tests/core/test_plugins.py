@@ -167,8 +167,9 @@ def test_our_names_stay_ours(theirs):
 
 def test_what_cannot_be_had_is_said_in_one_line(theirs, sequence):
     tracking, sampling = preset().tracking, preset().sampling
-    with pytest.raises(BadInput, match=r"expected one of builtin, .*somebodys, .*Did you mean somebodys"):
+    with pytest.raises(BadInput, match=r"expected one of builtin, .*somebodys, .*Did you mean somebodys") as refused:
         make_tracker("somebody", tracking)
+    assert str(refused.value).count("builtin,") == 1, "a name that both have is listed once"
     for name in ("gone", "their_lost_parts:Mine"):
         with pytest.raises(MissingBackend, match=rf"tracker {name}: their_lost_parts cannot be imported .* PYTHONPATH"):
             make_tracker(name, tracking)

@@ -13,7 +13,6 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.prompts import prompts_in
-from p2p_lib.evaluation.consistency import surface_fit
 from p2p_lib.figures import overlay, style
 from p2p_lib.synthetic.render import render
 from studies import mesh_view, own_data
@@ -102,7 +101,7 @@ def made():
 
 def test_at_the_true_pose_all_of_it_is_on_the_surface(made):
     sequence, run, bodies = made
-    fit = surface_fit(sequence, run, bodies, range(N))["box"]
+    fit = own_data.surface_fit(sequence, run, bodies, range(N))["box"]
     assert fit.index.tolist() == [0, 2, 3], "no pose, no say"
     assert (fit > 0.99).all(), "what hides it says nothing"
 
@@ -110,7 +109,7 @@ def test_at_the_true_pose_all_of_it_is_on_the_surface(made):
 def test_a_wrong_pose_shows_and_the_more_the_farther(made):
     sequence, run, bodies = made
     shares = [
-        surface_fit(sequence, run, bodies, [0], se3.exp(np.radians([0, deg, 0, 0, 0, 0])))["box"][0]
+        own_data.surface_fit(sequence, run, bodies, [0], se3.exp(np.radians([0, deg, 0, 0, 0, 0])))["box"][0]
         for deg in (0, 5, 10, 20)
     ]
     assert (np.diff(shares) < -0.05).all()
