@@ -56,6 +56,8 @@ _ANYWHERE = 0.7
 _PROMISING, _POLISH_SCALES = 0.3, (1.0, 0.4)
 _NEARBY = np.random.default_rng(0).normal(size=(150, 6)) * np.repeat([0.06, 0.015], 3)
 _NEARBY[0] = 0
+#: One pose shows clearly more than another by so many standard errors, of shares of so many points: a third faces it.
+_ERRORS, _COMPARED = 2.0, _POINTS // 3
 #: Iterations of the alignment, and its regularisation: a prior of these standard deviations, rad and m.
 _ITERATIONS, _FREE = 6, np.diag(np.repeat([0.1, 0.03], 3) ** -2.0)
 
@@ -90,6 +92,13 @@ class Sighting:
     T_cam_obj: np.ndarray
     share: float
     uv_px: np.ndarray
+
+    def clearly_above(self, other: Sighting) -> bool:
+        """Whether more shows than under another pose, by two standard errors of two shares of so many points."""
+        shares = np.clip([self.share, other.share], 0.0, 1.0)
+        # A share of all or nothing is not known exactly either.
+        variance = ((shares * (1 - shares)).sum() + 0.01) / _COMPARED
+        return bool(self.share - other.share >= _ERRORS * np.sqrt(variance))
 
 
 class ImageSearch:

@@ -52,10 +52,12 @@ class Proposal(Candidate):
 
     sighting  share of the surface that shows under its pose; None: not looked for
     lead      how much more shows than under the best other turn, as a share; None: not compared
+    slipped   whether it has replaced the pose of points that had slid over the surface
     """
 
     sighting: float | None = None
     lead: float | None = None
+    slipped: bool = False
 
     @property
     def evidence(self) -> PoseEvidence:
@@ -208,7 +210,8 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         best, reason = self._best(obs, known, candidates)
         if best is None:
             return None, reason
-        return self._compared(obs, known, best if best.refined else self.refine(obs, known, best)), reason
+        best = self._held(obs, known, best if best.refined else self.refine(obs, known, best))
+        return self._compared(obs, known, best), reason
 
     def _best(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
         """The candidate to go on with, and why."""
@@ -237,6 +240,29 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
             return candidates
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
+
+    def _held(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
+        """The pose of a followed object, or another turn in its place under which clearly more of the surface shows.
+
+        In a fast turn points slide over the surface, all alike, and agree on a pose that has stayed behind. That is
+        looked for where few keypoints agree; new points do not count, they agree with whatever placed them.
+        """
+        agree = np.count_nonzero(best.hypothesis.inliers & known.keypoints(obs))
+        many = agree >= self.config.lifecycle.return_inliers
+        due = not (many or known.life.unconfirmed or obs.mask is None)
+        if not (due and self.shape.knows(known) and "slips" in self.on):
+            return best
+        assert best.refined is not None, "it is refined before it is compared"
+        if may_slide(best.refined, self.config.refinement.min_eigenvalue, 2):
+            return best  # something flat shows as much a little farther on
+        near = self.shape.turned_near(obs, known, best.T_cam_obj, list(known.life.motion_priors().values()))
+        if near is None or near.share < SIGHTED:
+            return best
+        residual_m = np.linalg.norm(obs.p_cam - se3.transform(near.T_cam_obj, known.map.p_obj), axis=1)
+        residual_m[~obs.seen] = np.inf
+        agrees = residual_m <= self.config.registration.inlier_m
+        turned = Proposal(Hypothesis(near.T_cam_obj, agrees, residual_m, "surface"))
+        return replace(self.refine(obs, known, turned), sighting=near.share, slipped=True)
 
     def _compared(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
@@ -317,6 +343,8 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         """Nothing is learnt from a doubted pose, and one of little confidence makes no keyframe."""
         assert isinstance(best, Proposal) and isinstance(verdict, Judgement)
         belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
+        if belief is not None and best.slipped and best.sighting is not None:
+            belief = belief.shown(best.sighting)
         life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         most = DOUBTED if verdict.doubted or life.doubted else 1.0
         kept: dict[str, Any] = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}

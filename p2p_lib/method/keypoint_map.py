@@ -133,6 +133,10 @@ class KeypointMap:
         known = np.isin(keys, self.keys)
         self.p_obj[np.searchsorted(self.keys, keys[known])] = p_obj[known]
 
+    def give_up(self, rows: np.ndarray) -> None:
+        """End the time of those of some points (N,) bool that are pending: the next keyframe removes them."""
+        self._age[rows & ~self.promoted] = self.config.pending_ttl + 1
+
     def retire(self) -> tuple[np.ndarray, np.ndarray]:
         """Remove pending points past their time; under a cap, keypoints that mostly disagree or are too many.
 

@@ -16,7 +16,7 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.extended.confidence import Belief
 from p2p_lib.extended.default import chosen, object_tracker
-from p2p_lib.extended.image_search import ImageSearch
+from p2p_lib.extended.image_search import ImageSearch, Sighting
 from p2p_lib.extended.observation import area_m2, expected_px
 from p2p_lib.extended.outlook import Outlook
 from p2p_lib.extended.policy import OurPolicy, Proposal
@@ -1186,6 +1186,97 @@ def test_a_return_is_not_sure_while_another_turn_shows_as_much(monkeypatch):
     assert max(lump.see(turned(60)).estimate.confidence for _ in range(12)) == 0.5
     monkeypatch.setattr(ImageSearch, "otherwise", lambda *_: None)  # only points are left to tell
     assert max(lump.see(turned(60)).estimate.confidence for _ in range(5)) > 0.7
+
+
+# --- points that slide ---------------------------------------------------------------------------
+
+
+def slid(lump: Lump, T_wrong: np.ndarray, keypoints: int):
+    """All points that are seen follow another motion; of those that are keypoints no more than so many are seen."""
+    keys = lump.tracker.map
+
+    def spoil(tracks: Tracks) -> Tracks:
+        known = np.isin(tracks.ids, keys.ids[keys.promoted])
+        hidden = np.isin(np.arange(len(tracks)), np.flatnonzero(tracks.visible & known)[keypoints:])
+        return moved_to(T_wrong, lump, lambda t: t.ids >= 0)(replace(tracks, visible=tracks.visible & ~hidden))
+
+    return spoil
+
+
+def faster(deg: float) -> np.ndarray:
+    """So much farther round than 38 degrees, at once."""
+    return turned(38) @ se3.exp(np.array([0, 0, np.radians(deg), 0, 0, 0]))
+
+
+SLIPPING = {"sampling__max_visible": 30}  # as many as a keyframe adds: there is room where none is seen
+
+
+def test_points_that_stay_behind_in_a_fast_turn_are_given_up_for_what_shows():
+    lump = settled(begun(**SLIPPING), range(2, 40, 2))
+    keys = lump.tracker.map
+    spoil, ids, promoted = slid(lump, turned(38), 4), keys.ids.copy(), keys.promoted.copy()
+    seen = lump.observed(faster(30), spoil).seen
+    step = lump.see(faster(30), spoil)
+    assert lump.off(faster(30))[0] < 4 and lump.off(faster(30))[1] < 6 and step.estimate.inliers <= 2
+    assert step.estimate.confidence > 0.8, "that of a surface that shows"
+    assert len(step.requests.reject) >= 2 and set(step.requests.reject) <= set(ids[seen & promoted])
+    assert set(step.requests.drop) == set(ids[seen & ~promoted]), "new points that had slid"
+    assert step.estimate.keyframe
+    assert len(step.requests.add_px) == 30 - step.estimate.inliers, "what is given up takes no room"
+    for deg in (31, 32, 33):
+        lump.see(faster(deg))
+    assert lump.steps[-1].estimate.inliers >= 8 and lump.off(faster(33))[0] < 4
+
+
+def test_new_points_that_slid_alike_do_not_count_however_many():
+    lump = settled(begun(), range(2, 40, 2))
+    lump.tracker.map.promoted[4:] = False
+    step = lump.see(faster(30), moved_to(turned(38), lump, lambda tracks: tracks.ids >= 0))
+    assert lump.off(faster(30))[0] < 4 and len(step.requests.drop) >= 8
+
+
+@pytest.mark.parametrize(("keypoints", "settings"), [(60, {}), (4, {"method__mechanisms": "all but slips"})])
+def test_many_keypoints_are_believed_against_what_shows(keypoints, settings):
+    lump = settled(begun(**SLIPPING, **settings), range(2, 40, 2))
+    assert not len(lump.see(faster(30), slid(lump, turned(38), keypoints)).requests.add_px)
+    assert lump.off(faster(30))[0] > 15
+
+
+def test_a_frozen_map_takes_the_pose_and_no_points():
+    lump = settled(begun(), range(2, 40, 2))
+    lump.tracker.policy.frozen = True
+    step = lump.see(faster(30), slid(lump, turned(38), 4))
+    assert lump.off(faster(30))[0] < 4 and not step.estimate.keyframe and not len(step.requests.add_px)
+
+
+@pytest.mark.parametrize("loosest", [1, 2], ids=["a turn", "a turn and a shift"])
+def test_of_something_flat_that_shows_more_elsewhere_points_are_believed(loosest, monkeypatch):
+    lump = settled(begun(), range(2, 40, 2))
+    policy, known = lump.tracker.policy, lump.tracker.known
+    obs = lump.observed(faster(30), slid(lump, turned(38), 4))
+    best, _ = policy._best(obs, known, [policy.refine(obs, known, Proposal(h)) for h in policy.propose(obs, known)])
+    free = np.sort(best.refined.eigenvalues)
+    free[:loosest] = 0
+    loose = replace(best, refined=replace(best.refined, eigenvalues=free, free_rotations=np.zeros((0, 6))))
+    assert policy._held(obs, known, loose).slipped == (loosest == 1)
+    assert not policy._held(replace(obs, mask=None), known, best).slipped
+
+
+@pytest.mark.parametrize(("moved_m", "deg", "taken"), [(0, 15, True), (0, 5, False), (0.03, 15, False)])
+def test_what_clearly_shows_more_is_taken_where_it_turns_in_its_place(moved_m, deg, taken, monkeypatch):
+    lump = settled(begun(), range(2, 40, 2))
+    obs, shape, known = lump.observed(turned(38)), lump.tracker.policy.shape, lump.tracker.known
+    T, sample = known.life.T_cam_obj, shape.sample(known.model)
+    centre = sample.p_obj.mean(0)
+    about_it = se3.from_rt(np.eye(3), centre) @ se3.exp(np.array([0, np.radians(deg), 0, 0, 0, 0]))
+    there = se3.from_rt(np.eye(3), [moved_m, 0, 0]) @ T @ about_it @ se3.from_rt(np.eye(3), -centre)
+    monkeypatch.setattr(ImageSearch, "at", lambda *_: Sighting(T, 0.7, np.zeros((0, 2))))
+    monkeypatch.setattr(ImageSearch, "about", lambda *_: Sighting(there, 0.9, np.zeros((0, 2))))
+    assert (shape.turned_near(obs, known, T, []) is not None) == taken
+    monkeypatch.setattr(ImageSearch, "about", lambda *_: Sighting(there, 0.8, np.zeros((0, 2))))
+    assert shape.turned_near(obs, known, T, []) is None, "not clearly more"
+    monkeypatch.setattr(ImageSearch, "about", lambda *_: None)
+    assert shape.turned_near(obs, known, T, []) is None
 
 
 def test_questions_change_nothing():

@@ -203,6 +203,13 @@ def test_pending_points_have_their_time():
     assert len(points) == 0
 
 
+def test_pending_points_that_are_given_up_go_and_keypoints_stay():
+    points = pending(2)
+    points.add(np.array([20, 21]), np.zeros((2, 3)), promoted=True)
+    points.give_up(np.array([True, False, True, False]))
+    assert points.retire()[0].tolist() == [10] and points.keys.tolist() == [11, 20, 21]
+
+
 def test_keypoints_have_no_such_limit():
     points = KeypointMap(CFG)
     points.add(np.array([1, 2]), np.zeros((2, 3)), promoted=True)
