@@ -1260,6 +1260,11 @@ def test_of_something_flat_that_shows_more_elsewhere_points_are_believed(loosest
     loose = replace(best, refined=replace(best.refined, eigenvalues=free, free_rotations=np.zeros((0, 6))))
     assert policy._held(obs, known, loose).slipped == (loosest == 1)
     assert not policy._held(replace(obs, mask=None), known, best).slipped
+    for share in (0.45, 0.55):
+        monkeypatch.setattr(
+            policy.shape, "turned_near", lambda *_, share=share: Sighting(START, share, np.zeros((0, 2)))
+        )
+        assert policy._held(obs, known, best).slipped == (share > 0.5), "half of the surface has to show"
 
 
 @pytest.mark.parametrize(("moved_m", "deg", "taken"), [(0, 15, True), (0, 5, False), (0.03, 15, False)])
