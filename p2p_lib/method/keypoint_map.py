@@ -28,6 +28,7 @@ class KeypointMap:
     p_obj       (N, 3) object frame, metres
     promoted    (N,) bool
     confidence  (N,) of the pose that placed each
+    age         (N,) int64, frames since it was added, of a keypoint since it was promoted
     agreed      (N,) how many registrations each keypoint took part in and agreed with; 0 for pending points
     """
 
@@ -37,7 +38,7 @@ class KeypointMap:
         self.p_obj = np.zeros((0, 3))
         self.promoted = np.zeros(0, bool)
         self.confidence = np.zeros(0)
-        self._streak, self._age = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._streak, self.age = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self.agreed, self._disagreed = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._in_object, self._in_camera = np.zeros((0, _HISTORY, 3)), np.zeros((0, _HISTORY, 3))
         self._observations = np.zeros(0, np.int64)
@@ -104,7 +105,7 @@ class KeypointMap:
                      promoted. None: this is not tested
         """
         cfg = self.config
-        self._age += 1
+        self.age += 1
         passed = stable & np.isfinite(p_obj[:, 0]) & (uncertainty < cfg.max_uncertainty) & ~self.promoted
         self._streak = np.where(passed, self._streak + 1, 0)
         at = np.flatnonzero(passed)
@@ -120,7 +121,7 @@ class KeypointMap:
         if p_cam is not None:  # noise is the same in both, so even small scatters can be compared
             tight &= scatter_m < _scatter(self._in_camera[ready])[1]
         rows = ready[tight]
-        self.p_obj[rows], self.promoted[rows], self._age[rows] = centre[tight], True, 0
+        self.p_obj[rows], self.promoted[rows], self.age[rows] = centre[tight], True, 0
         return self.keys[rows]
 
     def count(self, used: np.ndarray, agreed: np.ndarray) -> None:
@@ -133,10 +134,6 @@ class KeypointMap:
         known = np.isin(keys, self.keys)
         self.p_obj[np.searchsorted(self.keys, keys[known])] = p_obj[known]
 
-    def give_up(self, rows: np.ndarray) -> None:
-        """End the time of those of some points (N,) bool that are pending: the next keyframe removes them."""
-        self._age[rows & ~self.promoted] = self.config.pending_ttl + 1
-
     def retire(self) -> tuple[np.ndarray, np.ndarray]:
         """Remove pending points past their time; under a cap, keypoints that mostly disagree or are too many.
 
@@ -145,13 +142,13 @@ class KeypointMap:
         bounds them. Returns the keys removed, and the tracker's ids of those that have one.
         """
         cfg = self.config
-        stale = ~self.promoted & (self._age > cfg.pending_ttl)
+        stale = ~self.promoted & (self.age > cfg.pending_ttl)
         seen = self.agreed + self._disagreed
         wrong = self.promoted & (seen >= _RETIRE_AFTER) & (self.agreed < _RETIRE_SHARE * seen)
         most = cfg.max_points or len(self)
         gone = stale | (wrong & (cfg.max_points > 0))
         kept = np.flatnonzero(self.promoted & ~gone)
-        usefulness = (self.agreed[kept] + 1) / (self._age[kept] + 1)
+        usefulness = (self.agreed[kept] + 1) / (self.age[kept] + 1)
         gone[kept[np.argsort(usefulness, kind="stable")[: max(len(kept) - most, 0)]]] = True
         removed, ids = self.keys[gone], self.ids[gone]
         for name in self._columns():

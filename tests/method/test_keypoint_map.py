@@ -203,13 +203,6 @@ def test_pending_points_have_their_time():
     assert len(points) == 0
 
 
-def test_pending_points_that_are_given_up_go_and_keypoints_stay():
-    points = pending(2)
-    points.add(np.array([20, 21]), np.zeros((2, 3)), promoted=True)
-    points.give_up(np.array([True, False, True, False]))
-    assert points.retire()[0].tolist() == [10] and points.keys.tolist() == [11, 20, 21]
-
-
 def test_keypoints_have_no_such_limit():
     points = KeypointMap(CFG)
     points.add(np.array([1, 2]), np.zeros((2, 3)), promoted=True)
@@ -338,7 +331,7 @@ def test_ids_of_the_tracker_are_assigned_by_key():
     assert points.ids.tolist() == [-1, -1, -1]
     unused = points.assign(np.array([7, 3, 2]), np.array([30, 31, 32]))
     assert unused.tolist() == [31] and points.ids.tolist() == [32, -1, 30]
-    points._age[:] = CFG.pending_ttl + 1
+    points.age[:] = CFG.pending_ttl + 1
     keys, ids = points.retire()
     assert keys.tolist() == [2, 4, 7] and ids.tolist() == [32, 30]
 
@@ -376,7 +369,7 @@ def test_rows_stay_together_when_points_go():
         alone[i] = KeypointMap(CFG)
         alone[i].add(np.array([i]), HERE[None] + i)
     for i in (0, 2, 3, 5):  # these are never seen and go when their time is up
-        together._age[i] = CFG.pending_ttl - 2
+        together.age[i] = CFG.pending_ttl - 2
     for k in range(5):
         seen = together.p_obj + rng.normal(0, 1e-3, (len(together), 3))
         seen[~np.isin(together.keys, (1, 4))] = np.nan
