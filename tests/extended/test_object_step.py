@@ -1249,6 +1249,14 @@ def test_a_frozen_map_takes_the_pose_and_no_points():
     assert lump.off(faster(30))[0] < 4 and not step.estimate.keyframe and not len(step.requests.add_px)
 
 
+def test_nothing_is_given_up_for_a_doubted_pose(monkeypatch):
+    lump = settled(begun(), range(2, 40, 2))
+    monkeypatch.setattr(OurPolicy, "outline", lambda self, obs: 0.2)  # the mask no longer ends where the object does
+    step = lump.see(faster(30), slid(lump, turned(38), 4))
+    assert lump.off(faster(30))[0] < 4 and step.estimate.confidence <= 0.5
+    assert not (step.estimate.keyframe or len(step.requests.reject) or len(step.requests.drop))
+
+
 @pytest.mark.parametrize("loosest", [1, 2], ids=["a turn", "a turn and a shift"])
 def test_of_something_flat_that_shows_more_elsewhere_points_are_believed(loosest, monkeypatch):
     lump = settled(begun(), range(2, 40, 2))
@@ -1260,6 +1268,10 @@ def test_of_something_flat_that_shows_more_elsewhere_points_are_believed(loosest
     loose = replace(best, refined=replace(best.refined, eigenvalues=free, free_rotations=np.zeros((0, 6))))
     assert policy._held(obs, known, loose).slipped == (loosest == 1)
     assert not policy._held(replace(obs, mask=None), known, best).slipped
+    returning = replace(known, life=replace(known.life, confirming=2))
+    assert not policy._held(obs, returning, best).slipped, (
+        "a return is compared with other turns, not with those nearby"
+    )
     for share in (0.45, 0.55):
         monkeypatch.setattr(
             policy.shape, "turned_near", lambda *_, share=share: Sighting(START, share, np.zeros((0, 2)))
@@ -1280,6 +1292,9 @@ def test_what_clearly_shows_more_is_taken_where_it_turns_in_its_place(moved_m, d
     assert (shape.turned_near(obs, known, T, []) is not None) == taken
     monkeypatch.setattr(ImageSearch, "about", lambda *_: Sighting(there, 0.8, np.zeros((0, 2))))
     assert shape.turned_near(obs, known, T, []) is None, "not clearly more"
+    share = {id(T): 0.7, id(there): 0.9}
+    monkeypatch.setattr(ImageSearch, "about", lambda _, near, __: Sighting(near, share[id(near)], np.zeros((0, 2))))
+    assert (shape.turned_near(obs, known, T, [there]) is not None) == taken, "near where its motion leads"
     monkeypatch.setattr(ImageSearch, "about", lambda *_: None)
     assert shape.turned_near(obs, known, T, []) is None
 
