@@ -214,7 +214,11 @@ def _config(a: argparse.Namespace) -> None:
     if a.json:
         print(json.dumps(rows))
         return
+    stage = ""
     for row in rows:
+        if (its := row["key"].partition(".")[0]) != stage:
+            stage = its
+            print("# " + _about(getattr(config, stage), stage))
         value = f"{row['value']} {row['unit']}".strip()
         value += f" [{row['source']}], preset {other}: {row[other]} [{row[f'{other}_source']}]" if a.diff else ""
         print(f"{row['key']} = {value}\n    {row['meaning']}" + f" [{row['source']}]" * (not a.diff))
@@ -222,6 +226,12 @@ def _config(a: argparse.Namespace) -> None:
             print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
     whose = "paper (its text), release (the authors' configuration) or ours"
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
+
+
+def _about(parameters: object, stage: str) -> str:
+    """A stage's heading: its name, what its parameters are of, and the section of the paper."""
+    first = (type(parameters).__doc__ or "").strip().partition("\n\n")[0]
+    return f"{stage}: {' '.join(first.split()).removeprefix('Of ')}".replace("``", "")
 
 
 @command(

@@ -208,8 +208,9 @@ class ImageSearch:
 
     def _distinct(self, found: Sighting, sample: SurfaceSample) -> bool:
         """Whether the surface fits worse beside its place: what fits a table anywhere proves nothing."""
-        spread = np.linalg.svd(sample.p_obj - sample.p_obj.mean(0), full_matrices=False)
-        along = 2 * spread[2][:2] * spread[1][:2, None] / np.sqrt(len(sample))
+        centred = sample.p_obj - sample.p_obj.mean(0)
+        axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
+        along = axes * np.ptp(centred @ axes.T, axis=0)[:, None]
         poses = np.repeat(found.T_cam_obj[None], 4, 0)
         poses[:, :3, 3] += np.concatenate([along, -along]) @ found.T_cam_obj[:3, :3].T
         share, _, _ = self._compare(poses, sample, _FINE_M)

@@ -589,7 +589,8 @@ def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
     assert "iterations = 100 [release], preset default: 400 [ours]\n" in capsys.readouterr().out
     assert cli.main(["config", "tsdf", "--set", "tsdf.voxel_m=0.007"]) == 0
     out = capsys.readouterr().out
-    assert "tsdf.voxel_m = 0.007 m\n    A voxel has this edge. [ours]" in out and "registration." not in out
+    assert out.startswith('# tsdf: the reconstructed surface (section "3D Reconstruction").\ntsdf.voxel_m = 0.007 m\n')
+    assert "\n    A voxel has this edge. [ours]" in out and "registration." not in out
     assert cli.main(["config", "tsdff"]) == 2
     assert "Did you mean tsdf?" in capsys.readouterr().err
 

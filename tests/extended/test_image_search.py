@@ -132,14 +132,30 @@ def test_outside_the_image_nothing_is_known():
     assert search(ball_in_front_of_a_wall()).about(moved(2.0, 0, 0), sample_of_the_ball()) is None
 
 
+def plate() -> SurfaceSample:
+    """A plain plate that faces the camera."""
+    side = np.linspace(-RADIUS_M, RADIUS_M, 18)
+    p = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
+    return replace(sample_of_the_ball(), p_obj=p[:300], n_obj=np.tile([0.0, 0, -1], (300, 1)))
+
+
 def test_what_fits_anywhere_proves_nothing():
     """A plain plate on a plain wall of its colour fits everywhere along it."""
     flat = Frame(0, 0.0, np.full((240, 320, 3), BLUE, np.uint8), np.full((240, 320), 0.6, np.float32))
-    side = np.linspace(-RADIUS_M, RADIUS_M, 18)
-    p = np.stack(np.meshgrid(side, side, [0.0]), -1).reshape(-1, 3)
-    plate = replace(sample_of_the_ball(), p_obj=p[:300], n_obj=np.tile([0.0, 0, -1], (300, 1)))
-    assert search(flat).at(PLACE, plate).share > 0.9
-    assert search(flat).about(PLACE, plate) is None
+    assert search(flat).at(PLACE, plate()).share > 0.9
+    assert search(flat).about(PLACE, plate()) is None
+
+
+def test_beside_it_is_where_nothing_of_it_is():
+    """Moved by half its length half of it lies on itself, and the rest on what is like it here and there."""
+    half = round(CAMERA.fx * RADIUS_M / 0.6)
+    spots = np.random.default_rng(0).random((240, 320, 1)) < 0.55
+    rgb = np.where(spots, BLUE, (150, 100, 90)).astype(np.uint8)
+    u, v = CAMERA.project(PLACE[:3, 3]).round().astype(int)
+    rgb[v - half : v + half + 1, u - half : u + half + 1] = BLUE
+    spotted = Frame(0, 0.0, rgb, np.full((240, 320), 0.6, np.float32))
+    found = search(spotted).about(PLACE, plate())
+    assert found is not None and np.linalg.norm((found.T_cam_obj - PLACE)[:3, 3]) < 0.01
 
 
 def sample_of(sdf) -> SurfaceSample:

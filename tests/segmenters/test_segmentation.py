@@ -347,6 +347,24 @@ def test_points_on_something_else_do_not_bring_it_back():
     assert not (follow.segment(gone, hints={"card": Hint(wrong)}) == 1).any()
 
 
+def test_points_that_agree_on_its_pose_bring_it_back_in_another_light():
+    """The camera looked away and exposes anew: nothing has the colours that were learnt."""
+    at, back, follow = (120, 80), (30, 150), segmenter()
+    follow.segment(picture(0, [(at, 1)]), on(card=at))
+    follow.segment(picture(1, [], board=card(at, (160, 120))))
+    bright = picture(2, [(back, 1)])
+    bright.rgb[:] = np.clip(bright.rgb * 0.3 + 170, 0, 255)
+    points = np.add(back, np.stack(np.meshgrid([8, 20, 35, 50], [8, 22, 40]), -1).reshape(-1, 2)).astype(float)
+
+    def found(hint: Hint) -> np.ndarray:
+        return copy.deepcopy(follow).segment(bright, hints={"card": hint}) == 1
+
+    assert iou(found(Hint(points, T_cam_obj=np.eye(4))), card(back)) > 0.9
+    assert not found(Hint(points)).any(), "no pose that they agree on"
+    place = np.append(CAMERA.unproject(np.add([back], [30, 25]), np.array([CARD_M + 0.05]))[0], 0.05)
+    assert not found(Hint(points[:3], T_cam_obj=np.eye(4), place=place)).any(), "too few"
+
+
 def test_colours_that_change_are_learned():
     """The light turns from red to blue; when the card comes back it has the colours that it had last."""
     at, follow = (120, 80), segmenter()
