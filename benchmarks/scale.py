@@ -41,8 +41,9 @@ the 95th percentile, and in processor time of all threads in the mean. Below 1 o
 
 What mechanisms are worth in accuracy is in [mechanisms.md](mechanisms.md), what memories of objects find again in
 [recall.md](recall.md) (`bench_recall.py`). `bench_offline.py` measures what `p2p refine` is worth, `bench_hand.py`
-a mug that a hand turns, `bench_first_masks.py` the masks that clicks start objects with, and `bench_features.py` what
-learned features would gain; each writes a page of its own here.
+a mug that a hand turns, `bench_variants.py` known videos as nobody has filmed them, `bench_first_masks.py` the masks
+that clicks start objects with, `bench_corrections.py` those that clicks correct, and `bench_features.py` what learned
+features would gain; each writes a page of its own here.
 
 """
 

@@ -170,3 +170,19 @@ def test_what_runs_without_truth_are_asked_for_is_known(load):
         chosen(RunOptions(**options).config())  # BadInput for a setting, a preset or a mechanism that is not known
     without = chosen(RunOptions(**bench.NO_GATES).config())
     assert without == MECHANISMS.keys() - GATES.keys() - DOUBTS.keys() and without
+
+
+def test_truth_is_where_a_varied_video_shows_its_objects(load, opening):
+    """Mirrored, turned, thinned and backwards: the middle of each object at its depth in its mask."""
+    bench, video = load("bench_variants"), opening("crossing", 6)
+    assert [len(of) for of in bench.variants(video)] == [6, 6, 6, 6, 3, 2, 6]
+    for of in bench.variants(video):
+        assert of.frame(0).rgb.shape[:2] == (of.camera.height, of.camera.width) and of.times_s[0] == 0
+        for name, truth in of.truth.items():
+            for i, T in enumerate(truth.T_cam_model):
+                frame, mask = of.frame(i), of.masks(i)[name]
+                np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
+                assert np.linalg.det(T[:3, :3]) > 0, f"{of.name}: no rotation"
+                u, v = of.camera.project(T[None, :3, 3])[0].round().astype(int)
+                assert mask[v, u], f"{of.name}: {name}"
+                assert 0 < T[2, 3] - frame.depth_m[v, u] < 0.1, f"{of.name}: {name}"
