@@ -105,14 +105,14 @@ class Lifecycle(Life):
         moved: dict[str, Any] = {n: None if T is None else T @ T_old_new for n, T in poses.items()}
         return replace(self, motion=motion, contour=contour, **moved)
 
-    def placed(self, T_world_cam: np.ndarray | None, degraded: bool = False) -> Lifecycle:
+    def placed(self, T_world_cam: np.ndarray | None) -> Lifecycle:
         """The state with the newest pose's place in the scene, once a return has been confirmed.
 
-        A ``degraded`` pose, as of a sliver at the image's border, does not replace a known place.
+        A degraded pose, as of a sliver at the image's border, does not replace a known place.
         """
         if T_world_cam is None or self.T_cam_obj is None or self.confirming:
             return self
-        if degraded and self.T_world_obj is not None:
+        if self.status is Status.DEGRADED and self.T_world_obj is not None:
             return self
         T_world_obj = T_world_cam @ self.T_cam_obj
         again = self.T_world_obj is not None and same_place(self.T_world_obj, T_world_obj)

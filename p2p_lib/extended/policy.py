@@ -395,8 +395,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         certain = best.hypothesis.support >= self.config.lifecycle.return_inliers
         if (certain or life.contour is None) and self._flat(best.refined):
             life = self._outlined(life, obs, best.T_cam_obj)
-        degraded = admitted.verdict.status is Status.DEGRADED
-        return life.placed(obs.frame.T_world_cam, degraded).moved(confidence)
+        return life.placed(obs.frame.T_world_cam).moved(confidence)
 
     def _outlined(self, life: Lifecycle, obs: OurObservation, T_cam_obj: np.ndarray) -> Lifecycle:
         """The life with the contour that is seen under a pose, where that can be known."""

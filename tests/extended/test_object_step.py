@@ -16,11 +16,10 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.extended.confidence import Belief
 from p2p_lib.extended.default import chosen, object_tracker
-from p2p_lib.extended.gates import Judgement
 from p2p_lib.extended.image_search import ImageSearch, Sighting
 from p2p_lib.extended.observation import area_m2, expected_px
 from p2p_lib.extended.outlook import Outlook
-from p2p_lib.extended.policy import BelievedAdmission, OurPolicy, Proposal
+from p2p_lib.extended.policy import OurPolicy, Proposal
 from p2p_lib.method import refinement
 from p2p_lib.method.object_tracker import ObjectStep
 from p2p_lib.method.registration import Hypothesis
@@ -374,23 +373,6 @@ def test_what_lay_still_is_out_of_view_where_the_camera_turned_away():
 
     assert said(replace(lay, rested=0), away) == said(lay, np.eye(4)) == "0 mask pixels", "a hand may have it"
     assert said(lay, away) == said(lump.tracker.life, None) == "out of view: 0 mask pixels"
-
-
-def test_what_is_said_to_be_degraded_leaves_its_place_as_it_was():
-    """As of something that is half out of the image, of which nothing tells any more how it is turned."""
-    lump = settled(begun(), [2])
-    policy, known, obs = lump.tracker.policy, lump.tracker.known, lump.observed(turned(3))
-    obs = replace(obs, frame=replace(obs.frame, T_world_cam=np.eye(4)))
-    best = policy.refine(obs, known, Proposal(lump.registered(obs)[0]))
-    lay = replace(known, life=replace(known.life, T_world_obj=known.life.T_cam_obj))
-    admission = policy.admit(obs, lay, best, Judgement(True, Status.TRACKED, ""))
-    assert admission.verdict.status is Status.TRACKED
-
-    def moved(of: BelievedAdmission) -> bool:
-        return not np.array_equal(policy.followed(obs, lay, best, of, 1.0).T_world_obj, lay.life.T_world_obj)
-
-    doubtful = replace(admission.verdict, status=Status.DEGRADED)
-    assert moved(admission) and not moved(replace(admission, verdict=doubtful))
 
 
 # --- what is believed, kept and asked for ------------------------------------------------------
