@@ -53,8 +53,8 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     background = (patch.border() | barred) & ~seeds
     x = keep_seeded_components(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
     own_colours = colour[x > 0.5]
-    # In another light it has other colours; points that agree on its pose are on it all the same.
-    sure = hint.sighted or hint.T_cam_obj is not None
+    # Back in another light it has other colours; points that agree on its pose are on it all the same.
+    sure = hint.sighted or (hint.T_cam_obj is not None and target.seen is None)
     return (patch.box, patch.up(x)) if len(own_colours) and (sure or own_colours.mean() > 0) else None
 
 
