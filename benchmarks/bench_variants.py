@@ -2,9 +2,9 @@
 
     python benchmarks/bench_variants.py OUT --data DIR [--seeds N] [--only NAME ...]
 
-Writes ``benchmarks/variants.md``; runs go below OUT, and those that are there already are not repeated. What works on a
-known video by chance, or by what was chosen while looking at it, breaks here. DIR holds the sequences of ``VIDEOS`` and
-the clicks, ``prompts/NAME.json``, of those that have no masks.
+Writes ``benchmarks/variants.md``; runs go below OUT, where what was cut short goes on. What works on a known video by
+chance, or by what was chosen while looking at it, breaks here. DIR holds the sequences of ``VIDEOS`` and the clicks,
+``prompts/NAME.json``, of those that have no masks.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ Written by `python benchmarks/bench_variants.py`; do not edit. {machine}
 
 Real video, three clicks an object; where the dataset has masks they are drawn inside that of the first frame. Mean over
 objects and seeds {seeds}, in brackets the lowest and highest seed; *lost*: frames in which an object is to be seen and
-has no pose; *found again*: returns after complete occlusion or out of view, and how many took more than ten frames or
-were missed. Of one image of three everything moves three times as far.
+has no pose; *found again*: within ten frames, of all returns after complete occlusion or out of view. With one image of
+three everything moves three times as far.
 
 {rows}"""
 
@@ -176,8 +176,7 @@ def scored(of: Varied, how: dict, runs: list[Path]) -> dict[str, object]:
     """The columns of one variant, tracked into one folder a seed."""
     scores = []
     for seed, out in enumerate(runs):
-        if not (out / "poses.npz").is_file():
-            run(of, out, seed=seed, if_exists="replace", progress=False, **how)
+        run(of, out, seed=seed, if_exists="resume", progress=False, **how)
         scores.append(list(evaluate(load_run(out)).objects.values()))
     every = [score for seed in scores for score in seed]
     returns = [event.frames_to_recovery for score in every for event in score.returns]
