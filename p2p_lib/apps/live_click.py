@@ -12,12 +12,13 @@ import numpy as np
 
 from p2p_lib.apps.click import Clicker
 from p2p_lib.apps.live_words import Words
+from p2p_lib.core.depth_edges import depth_step_m
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.cameras import LiveCamera, Stream
 from p2p_lib.datasets.prompts import parse_prompts, run_lengths
-from p2p_lib.segmenters.builtin.patch import depth_step_m, dilated
+from p2p_lib.segmenters.builtin.patch import dilated
 
 #: A colour that is so much another, of 255, is no noise; what has moved differs in so large a share of its colours, or
 #: of its depths. By these a mask is refused from where 0.92 of it is still right on, and always below 0.88.

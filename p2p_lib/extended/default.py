@@ -19,6 +19,7 @@ from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.memory import ObjectMemory
+from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
 from p2p_lib.extended.policy import OurPolicy
@@ -32,7 +33,8 @@ from p2p_lib.method import pipeline
 #: Name to what it does.
 MECHANISMS = {
     # Before a frame: frame_guard.
-    "moments": "Depth is ignored while depth and colour are of different moments.",
+    "moments": "Depth is ignored while it or colour repeats the same image and the other changes.",
+    "lag": "Depth is moved onto colour where a moving camera takes the two at different moments.",
     # Around track and segment: reacquisition, outlook.
     "scene": "Camera motion, from the static scene, tells where an object at rest is.",
     "shape_search": "Absent objects are searched for by the shape and colour of their surface.",
@@ -170,7 +172,8 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
     if "scene" in on:
         scene = Scene(camera, config.depth, np.random.default_rng([config.seed, 2]))
     front = partial(Reacquisition, on=on, scene=scene)
-    return pipeline.Parts(FrameGuard("moments" in on), front, partial(object_tracker, on=on))
+    guard = FrameGuard("moments" in on, DepthLag() if "lag" in on else None)
+    return pipeline.Parts(guard, front, partial(object_tracker, on=on))
 
 
 def object_tracker(*paper: Any, on: Container[str] = frozenset(MECHANISMS), map_id: int = 0) -> TwoMaps:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from p2p_lib.core.depth import far_depth
 from p2p_lib.core.errors import doubt
 from p2p_lib.core.types import Frame
+from p2p_lib.extended.depth_lag import DepthLag
 
 #: Depth, colour or both may repeat for so long, s: some cameras deliver one of them less often.
 _STANDS_S = 0.08
@@ -36,11 +37,12 @@ class DoubtedFrame(Frame):
 class FrameGuard:
     """Looks at every frame before anything else does.
 
-    moments  whether depth counts as missing where it is not of the moment of its colour
+    moments  whether depth counts as missing while it, or colour, stands still
+    lag      what moves depth onto colour where a moving camera takes the two apart; None: they are used as they come
     """
 
-    def __init__(self, moments: bool = True):
-        self._moments = moments
+    def __init__(self, moments: bool = True, lag: DepthLag | None = None):
+        self._moments, self._lag = moments, lag
         self._time_s, self._stopped, self._warned = -np.inf, False, False  # of the frame before
         self._stale, self._slow = StaleFrames(), 0  # how many frames in a row came so slowly
         self._newest: Frame | None = None
@@ -60,9 +62,22 @@ class FrameGuard:
         if self._newest is not None and (far := far_depth(frame)):  # such a first frame is refused
             remarks.append(far)
             changes["depth_m"] = np.zeros_like(frame.depth_m)
+        if not changes and (depth_m := self._of_its_moment(frame)) is not None:
+            frame = replace(frame, depth_m=depth_m)
         remark = "; ".join(filter(None, remarks))
         self._newest = DoubtedFrame.of(frame, remark=remark, still=still, **changes) if remark or still else frame
         return self._newest
+
+    def _of_its_moment(self, frame: Frame) -> np.ndarray | None:
+        """The depth of a frame where it has to be moved onto its colour; the first time is warned of."""
+        if self._lag is None:
+            return None
+        known, depth_m = self._lag.off_px, self._lag.moved(frame)
+        if self._lag.off_px and not known:
+            got = f"of different moments while the camera moves, {self._lag.off_px:.0f} px apart in frame {frame.index}"
+            fix = "Depth is moved onto colour from here on; poses are better of a camera that takes both together."
+            doubt("depth and colour", got, fix)
+        return depth_m
 
     def _time_remark(self, frame: Frame) -> str:
         """What to say of a time that goes back, or no longer on; the first is warned of, too.

@@ -8,9 +8,9 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth_edges import depth_step_m
 from p2p_lib.core.image import bounds, nearest_px
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.patch import depth_step_m
 
 #: Less than this of the mask seen again, as a share, says that the motion or the mask is wrong.
 _SEEN_AGAIN = 0.5

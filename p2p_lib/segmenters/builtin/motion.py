@@ -8,8 +8,9 @@ import numpy as np
 
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.depth_edges import depth_step_m
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.patch import Patch, depth_step_m, dilated
+from p2p_lib.segmenters.builtin.patch import Patch, dilated
 
 #: Two views of one point differ by less than this in colour, as a mean over the channels.
 _SAME_COLOUR = 40.0

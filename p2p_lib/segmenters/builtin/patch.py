@@ -11,13 +11,12 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.depth_edges import depth_step_m
 from p2p_lib.core.image import bounds
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
 
-#: Depth changes by this much from cell to cell of the grid on surfaces seen at a slant.
-_SLANT_M = 0.004
 #: At most so many values are used for a median.
 _ENOUGH = 400
 #: Points drawn to find a support plane, and planes tried.
@@ -232,11 +231,6 @@ def _middles(image: np.ndarray, cell_px: int) -> np.ndarray:
 def approximate_median(values: np.ndarray) -> float:
     """The median of values (N,), by some hundreds of them where there are many: exact medians are slow."""
     return float(np.median(values[:: 1 + len(values) // _ENOUGH]))
-
-
-def depth_step_m(depth_m: np.ndarray) -> np.ndarray:
-    """(...,) the change of depth (...,) beyond which it is an edge, not noise or slant."""
-    return 3 * depth_noise_m(depth_m) + _SLANT_M
 
 
 def dilated(region: np.ndarray, radius: int) -> np.ndarray:
