@@ -244,6 +244,8 @@ FAULTS: dict[str, Fault] = {
     "none": Fault(),
     # Depth as it was before all of it.
     "depth frozen": _depth(lambda depth_m, of, i: of.original.frame(of.before).depth_m),
+    # Frames: of a camera that takes colour and depth at different moments.
+    "depth late": _depth(lambda depth_m, of, i: of.original.frame(max(i - round(of.severity), 0)).depth_m),
     # A factor.
     "depth scaled": _depth(lambda depth_m, of, i: depth_m * of.severity),
     # Another factor in every image, which differs from 1 by so much at most: a network for single images.

@@ -52,6 +52,7 @@ def test_depth(good):
     now, before = good.frame(4).depth_m, good.frame(START - 1).depth_m
     at = {name: faulty(good, name).frame(4).depth_m for name in FAULTS if name.startswith("depth")}
     np.testing.assert_array_equal(at["depth frozen"], before)
+    np.testing.assert_array_equal(at["depth late"], good.frame(3).depth_m)
     np.testing.assert_allclose(at["depth scaled"], 1.2 * now, rtol=1e-6)
     np.testing.assert_allclose(at["depth offset"], now + 0.1, rtol=1e-6)
     np.testing.assert_array_equal(at["depth misaligned"][:, 7:], now[:, :-7])

@@ -1,0 +1,138 @@
+"""Depth of another moment than its colour is moved onto it, and depth of the same moment stays where it is."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import preset
+from p2p_lib.core.errors import Doubt
+from p2p_lib.core.types import Frame
+from p2p_lib.extended.default import MECHANISMS, compose
+from p2p_lib.extended.depth_lag import DepthLag
+from p2p_lib.extended.frame_guard import FrameGuard
+from p2p_lib.synthetic.faults import Faulty
+
+W, H, FAR_M, NEAR_M = 640, 480, 1.5, 0.9
+
+
+def panorama() -> tuple[np.ndarray, np.ndarray]:
+    """A printed wall with cards before it: colour (h, w, 3) uint8 and depth (h, w), three images high and wide."""
+    rng = np.random.default_rng(0)
+    print_ = cv2.GaussianBlur(rng.normal(0, 60, (3 * H, 3 * W)).astype(np.float32), (0, 0), 3)
+    depth = np.full(print_.shape, FAR_M, np.float32)
+    for left, top in rng.integers(0, [3 * W - 120, 3 * H - 90], (90, 2)):
+        card = np.s_[top : top + 90, left : left + 120]
+        print_[card] += rng.choice([-60, 60])
+        depth[card] = NEAR_M
+    gray = np.clip(print_ + 120 + rng.normal(0, 2, print_.shape), 0, 255).astype(np.uint8)
+    return np.repeat(gray[..., None], 3, 2), depth
+
+
+RGB, DEPTH = panorama()
+
+
+def view(px: float, roll_deg: float, image: np.ndarray) -> np.ndarray:
+    """What a camera shows of it, moved by (px, px / 3) from the middle and turned about its axis."""
+    centre = 1.5 * np.array([W, H])
+    onto = cv2.getRotationMatrix2D(centre.tolist(), roll_deg, 1)
+    onto[:, 2] -= centre - np.array([W, H]) / 2 + np.array([px, px / 3])
+    return cv2.warpAffine(image, onto, (W, H), flags=cv2.INTER_NEAREST)
+
+
+def film(px: float, roll_deg: float, late: float, frames: int = 6) -> list[tuple[Frame, np.ndarray]]:
+    """Frames of a camera that moves by so much from each to the next, depth being late by so many; its depth now."""
+    shown = []
+    for k in range(frames):
+        depth = view(px * (k - late), roll_deg * (k - late), DEPTH)
+        shown.append((Frame(k, k / 30, view(px * k, roll_deg * k, RGB), depth), view(px * k, roll_deg * k, DEPTH)))
+    return shown
+
+
+def wrong(depth: np.ndarray, now: np.ndarray) -> float:
+    """The share of measured pixels that are off."""
+    return float((depth[depth > 0] != now[depth > 0]).mean())
+
+
+@pytest.mark.parametrize(
+    ("px", "roll_deg", "late"), [(30, 0, 1), (-40, 0, 0.5), (36, 0, -1), (20, 4, 1), (45, -2, 0.5)]
+)
+def test_depth_that_is_late_or_early_is_moved_onto_colour(px, roll_deg, late):
+    lag = DepthLag()
+    for frame, now in film(px, roll_deg, late):
+        depth = lag.moved(frame)
+        if frame.index:
+            assert depth is not None and wrong(depth, now) < 0.25 * wrong(frame.depth_m, now)
+            assert (depth > 0).mean() > 0.85
+    assert lag.off_px == pytest.approx(abs(late) * np.hypot(px, px / 3), rel=0.2)
+
+
+@pytest.mark.parametrize(("px", "roll_deg", "late"), [(0, 0, 0), (30, 0, 0), (60, 4, 0), (3, 0, 1)])
+def test_depth_of_the_same_moment_and_of_a_slow_camera_stays(px, roll_deg, late):
+    lag = DepthLag()
+    assert [lag.moved(frame) for frame, _ in film(px, roll_deg, late)] == [None] * 6 and not lag.off_px
+
+
+def test_of_a_camera_that_takes_them_apart_small_offsets_are_undone_too():
+    slow, lag = film(8, 0, 1), DepthLag()
+    assert [lag.moved(frame) for frame, _ in slow] == [None] * 6
+    for frame, _ in film(30, 0, 1):
+        lag.moved(frame)
+    for k, (frame, now) in enumerate(slow):
+        depth = lag.moved(frame)
+        if k:
+            assert depth is not None and wrong(depth, now) < 0.3 * wrong(frame.depth_m, now)
+
+
+def test_without_edges_or_with_another_image_nothing_is_moved():
+    lag, (first, second, *_) = DepthLag(), (frame for frame, _ in film(30, 0, 1))
+    assert lag.moved(first) is None
+    assert lag.moved(replace(second, depth_m=np.ones_like(second.depth_m))) is None, "no step of depth"
+    half = Frame(2, 0.1, first.rgb[::2].copy(), first.depth_m[::2].copy())
+    assert lag.moved(half) is None, "of another size than the one before"
+    noise = np.random.default_rng(1).integers(0, 256, second.rgb.shape, np.uint8)
+    assert lag.moved(first) is None and lag.moved(replace(second, rgb=noise)) is None, "no common motion"
+
+
+def test_every_frame_is_looked_at_and_the_first_offset_is_warned_of():
+    guard = FrameGuard(lag=DepthLag())
+    frames = film(30, 0, 1)
+    guard(frames[0][0])
+    with pytest.warns(
+        Doubt, match="depth and colour: of different moments while the camera moves, 3. px apart"
+    ) as told:
+        used = [guard(frame) for frame, _ in frames[1:]]
+    assert len(told) == 1
+    for frame, (given, now) in zip(used, frames[1:], strict=True):
+        assert wrong(frame.depth_m, now) < 0.25 * wrong(given.depth_m, now)
+        assert not frame.remark and guard(used[-1]) is used[-1]
+
+
+def test_it_is_a_mechanism():
+    camera, frames = Camera(525.0, 525.0, 319.5, 239.5, W, H), film(30, 0, 1)
+    for spec, kept in (("all but lag", True), ("lag", False)):
+        before = compose(camera, preset().with_values({"method.mechanisms": spec})).before
+        before(frames[0][0])
+        if kept:
+            assert before(frames[1][0]) is frames[1][0]
+        else:
+            with pytest.warns(Doubt, match="different moments"):
+                assert before(frames[1][0]) is not frames[1][0]
+    assert "lag" in MECHANISMS
+
+
+def test_on_rendered_images_with_noise_and_blur(opening):
+    """The fast camera of a bundled sequence, its depth a frame late: what is off comes down to what noise leaves."""
+    good = opening("cluttered_desk", 90)
+    lag, bad, before, after = DepthLag(), Faulty(good, "depth late"), [], []
+    for i in range(len(good)):
+        frame, now = bad.frame(i), good.frame(i).depth_m
+        depth = lag.moved(frame)
+        if depth is not None:
+            for shares, z in ((before, frame.depth_m), (after, depth)):
+                both = (z > 0) & (now > 0)
+                shares.append((np.abs(z - now)[both] > 0.1).mean())
+    assert len(after) > 20 and np.mean(after) < 0.6 * np.mean(before)
+    assert not any(DepthLag().moved(good.frame(i)) is not None for i in range(len(good)))
