@@ -25,8 +25,9 @@ _STRIDE_PX, _AGREE_PX, _AGREEING = 8, 1.5, 0.5
 _SHARES = np.linspace(-1, 1, 9)
 #: With fewer pixels on the near side of steps there is no answer.
 _MIN_STEPS = 150
-#: The gradient of brightness on steps has to be higher than where depth lies by this, in standard deviations.
-_MIN_GAIN = 0.1
+#: The gradient of brightness on steps has to be above its mean, and above that where depth lies, by so many of its
+#: standard deviations.
+_MIN_FIT, _MIN_GAIN = 0.3, 0.1
 #: An offset that does not matter, as a fraction of the image's width; and one after which a camera is known to take
 #: the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
 _SMALL, _APART = 0.005, 0.02
@@ -92,4 +93,5 @@ def _late(frame: Frame, per_frame: np.ndarray) -> float:
     end = np.clip(end, 0, np.array(edges.shape[::-1]) - 1)
     fits = edges[end[..., 1], end[..., 0]].mean(1)
     best = fits.argmax()
-    return float(_SHARES[best]) if fits[best] - fits[len(_SHARES) // 2] > _MIN_GAIN else 0.0
+    clear = fits[best] > max(_MIN_FIT, fits[len(_SHARES) // 2] + _MIN_GAIN)
+    return float(_SHARES[best]) if clear else 0.0
