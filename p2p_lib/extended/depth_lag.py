@@ -28,9 +28,9 @@ _MIN_STEPS = 150
 #: The gradient of brightness on steps has to be above its mean, and above that where depth lies, by so many of its
 #: standard deviations.
 _MIN_FIT, _MIN_GAIN = 0.3, 0.1
-#: An offset that does not matter, as a fraction of the image's width; and one after which a camera is known to take
-#: the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
-_SMALL, _APART = 0.005, 0.02
+#: A way that is too short to tell, as a fraction of the image's width; and an offset after which a camera is known to
+#: take the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
+_SHORT, _APART = 0.005, 0.02
 
 
 class DepthLag:
@@ -51,11 +51,11 @@ class DepthLag:
             return None
         height, width = frame.shape
         way_px = float(np.hypot(*per_frame @ [width / 2, height / 2, 1]))
-        least_px = (_SMALL if self.off_px else _APART) * width
-        share = _late(frame, per_frame) if way_px > least_px else 0.0
-        if abs(share) * way_px <= least_px:
+        share = _late(frame, per_frame) if way_px > (_SHORT if self.off_px else _APART) * width else 0.0
+        if not self.off_px and abs(share) * way_px > _APART * width:
+            self.off_px = abs(share) * way_px
+        if not share or not self.off_px:
             return None
-        self.off_px = self.off_px or abs(share) * way_px
         onto = share * per_frame + np.eye(2, 3)
         return cv2.warpAffine(frame.depth_m, onto, (width, height), flags=cv2.INTER_NEAREST)
 
