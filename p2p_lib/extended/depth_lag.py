@@ -20,9 +20,9 @@ _FLOW_PX, _EDGES_PX = 160, 320
 #: Mean change of brightness, grey levels, below which the camera does not move.
 _STILL = 2.0
 #: Every so many pixels a motion is taken; most of them have to agree, within so many pixels, with that of the image.
-_STRIDE_PX, _AGREE_PX, _AGREEING = 8, 1.5, 0.5
+_STRIDE_PX, _AGREE_PX, _AGREEING = 8, 3.0, 0.5
 #: Shares of the way that are tried: depth may be late by up to a frame, or early.
-_SHARES = np.linspace(-1, 1, 9)
+_SHARES = np.linspace(-1, 1, 17)
 #: With fewer pixels on the near side of steps there is no answer.
 _MIN_STEPS = 150
 #: The gradient of brightness on steps has to be above its mean, and above that where depth lies, by so many of its
@@ -42,7 +42,7 @@ class DepthLag:
     def __init__(self) -> None:
         self.off_px = 0.0
         self._before: np.ndarray | None = None
-        self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def moved(self, frame: Frame) -> np.ndarray | None:
         """The depth (H, W) of the next frame where it has to be moved; where it moves in from outside, unmeasured."""
