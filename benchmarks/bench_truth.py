@@ -30,9 +30,9 @@ from p2p_lib.extended.depth_lag import DepthLag
 
 VIDEOS = ("desk_fast", "redkitchen_table")
 #: Corners of an image, and the ratio that a match needs.
-_CORNERS, _RATIO = 2000, 0.8
+_CORNERS, _RATIO = 1200, 0.8
 #: Depth is believed between these, m; of so many frames one is matched to all others.
-_NEAR_M, _FAR_M, _EVERY = 0.3, 3.5, 12
+_NEAR_M, _FAR_M, _EVERY = 0.3, 3.5, 20
 #: Reprojection errors that agree, px, in turn; fewer agreeing corners say nothing.
 _AGREE_PX, _LEAST = (8.0, 4.0, 3.0), 25
 _ROUNDS = 4
