@@ -38,6 +38,7 @@ from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
 from p2p_lib.evaluation.known_size import Lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.evaluation.suspicions import doubt_growth
+from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.method.sampling import choose, usable_region
 
 #: Frames that are looked at, evenly spread.
@@ -125,7 +126,7 @@ def check_folder(
     depth = _depth(frames, scale, None if firsts else config.depth)  # of objects it is told apart
     findings = [*wrong, Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
     pairs = [(f, after) for f in frames if (after := _readable(sequence, f.index + 1)) is not None]
-    findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames)]
+    findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames, pairs)]
     if depth.level is Level.WRONG:
         return findings  # nothing that follows would mean anything
     findings.append(_truth(sequence))
@@ -338,12 +339,18 @@ def _depth(frames: list[Frame], scale: float, counts: DepthConfig | None) -> Fin
     return Finding("depth", Level.OK, text)
 
 
-def _registered(frames: list[Frame]) -> Finding:
-    """Whether depth was registered to the colour camera."""
+def _registered(frames: list[Frame], pairs: list[tuple[Frame, Frame]]) -> Finding:
+    """Whether depth was registered to the colour camera, and is of its moment in pairs of neighbouring images."""
     name, found = "registration", misfit(frames)
     if found is None:
         fix = "Be sure that the camera's software aligns them: what is not aligned gives poses that are wrong or lost."
         return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree", fix)
+    for before, after in pairs if found.doubt is None else ():
+        lag = DepthLag()
+        lag.moved(before)
+        if lag.moved(after) is not None:
+            text, fix = lag.doubt
+            return Finding(name, Level.LOOK, f"depth and colour are {text} in frame {after.index}", fix)
     if found.doubt is None:
         return Finding(name, Level.OK, "edges of depth lie on edges of colour")
     text, fix = found.doubt

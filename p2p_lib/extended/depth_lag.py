@@ -44,6 +44,12 @@ class DepthLag:
         self._before: np.ndarray | None = None
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
+    @property
+    def doubt(self) -> tuple[str, str]:
+        """What is wrong with a camera that takes them apart, in words, and what to do."""
+        got = f"of different moments while the camera moves, {self.off_px:.0f} px apart"
+        return got, "Depth is moved onto colour from then on; poses are better of a camera that takes both together."
+
     def moved(self, frame: Frame) -> np.ndarray | None:
         """The depth (H, W) of the next frame where it has to be moved; where it moves in from outside, unmeasured."""
         per_frame = self._motion(frame.rgb)

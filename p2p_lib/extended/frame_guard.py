@@ -74,9 +74,8 @@ class FrameGuard:
             return None
         known, depth_m = self._lag.off_px, self._lag.moved(frame)
         if self._lag.off_px and not known:
-            got = f"of different moments while the camera moves, {self._lag.off_px:.0f} px apart in frame {frame.index}"
-            fix = "Depth is moved onto colour from here on; poses are better of a camera that takes both together."
-            doubt("depth and colour", got, fix)
+            got, fix = self._lag.doubt
+            doubt("depth and colour", f"{got} in frame {frame.index}", fix)
         return depth_m
 
     def _time_remark(self, frame: Frame) -> str:

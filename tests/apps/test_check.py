@@ -27,6 +27,7 @@ from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
 from p2p_lib.synthetic.faults import Faulty
+from tests.extended.test_depth_lag import film
 
 CAMERA = open_sequence("synthetic/crossing").camera
 
@@ -120,6 +121,19 @@ def test_times_that_jump_back_are_those_of_two_recordings(good, tmp_path):
     np.savetxt(folder / "times.txt", np.r_[half, half])
     finding = found(folder, "files")
     assert finding.level is Level.WRONG and "times.txt: got 0.000000 s at frame 3" in finding.text
+
+
+def test_depth_of_another_moment_than_its_colour_is_told(tmp_path):
+    for name in ("rgb", "depth"):
+        (tmp_path / name).mkdir()
+    for now, late in zip(film(30, 0, 0), film(30, 0, 1), strict=True):  # as clocks that are apart make it: by turns
+        frame = (late if late[0].index in (3, 4) else now)[0]
+        cv2.imwrite(str(tmp_path / "rgb" / f"{frame.index:03d}.png"), frame.rgb)
+        cv2.imwrite(str(tmp_path / "depth" / f"{frame.index:03d}.png"), (1000 * frame.depth_m).astype(np.uint16))
+    np.savetxt(tmp_path / "cam_K.txt", CAMERA.K)
+    finding = found(tmp_path, "registration")
+    assert finding.level is Level.LOOK and "takes both together" in finding.fix
+    assert re.search(r"depth and colour are of different moments .*, 3\d px apart in frame 3$", finding.text)
 
 
 def test_an_embedded_sequence_raises_no_alarm():
