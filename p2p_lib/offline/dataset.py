@@ -102,7 +102,7 @@ class _Labels:
     def _render_all(self, i: int) -> tuple[Frame, dict[str, Silhouette]]:
         """The image, and each labelled object in it as if nothing hid it."""
         poses = {name: of.T_cam_model[i] for name, of in self.truth.items() if of.labelled[i]}
-        return self.made.sequence.frame(i), {name: self._render[name](T) for name, T in poses.items()}
+        return self.made.frame(i), {name: self._render[name](T) for name, T in poses.items()}
 
     def frame(self, i: int) -> Frame:
         """The image."""
@@ -190,7 +190,7 @@ def write_foundationpose(
         for name, (start, mask) in first.items():
             at, numbers = there / name, [int(i) for i in made.frames if i >= start]
             for i in numbers:
-                frame = made.sequence.frame(i)
+                frame = made.frame(i)
                 images.save_png(at / "rgb" / f"{i:06d}.png", frame.rgb)
                 depth_mm = np.clip(np.rint(frame.depth_m.astype(float) * 1000), 0, 65535).astype(np.uint16)
                 images.save_png(at / "depth" / f"{i:06d}.png", depth_mm)

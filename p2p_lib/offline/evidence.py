@@ -82,7 +82,7 @@ def gather(made: Finished, names: list[str], config: Config, folder: Path, bar: 
     found = {name: VideoEvidence(StoredClouds(folder)) for name in names}
     wanted = evenly(np.arange(len(frames)), KEYFRAMES)
     for k, i in enumerate(frames.tolist()):
-        frame, masks = made.sequence.frame(i), made.masks(i)
+        frame, masks = made.frame(i), made.masks(i)
         good = off_edges(frame.depth_m, STEP_M) & in_range(frame.depth_m, config.depth)
         for name, of in found.items():
             mask = masks.get(name, np.zeros(frame.shape, bool))

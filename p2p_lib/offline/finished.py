@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,12 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import check_new
 from p2p_lib.core.raycasting import cast, ray_scene
-from p2p_lib.core.types import DOUBTED
+from p2p_lib.core.types import DOUBTED, Frame
 from p2p_lib.datasets.mask_log import CELL_PX, load_masks
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
+from p2p_lib.extended.depth_lag import DepthLag
 
 #: The one rule of what is labelled; ``{0}`` is the least confidence.
 RULE = (
@@ -86,6 +87,23 @@ class Finished:
     def frames(self) -> np.ndarray:
         """(n,) frame numbers of the sequence that the run is over."""
         return next(iter(self.run.objects.values())).frame_index
+
+    @cached_property
+    def _apart(self) -> bool:
+        """Whether the run found that its camera takes depth and colour at different moments."""
+        said = DepthLag().doubt[0].partition(",")[0]
+        return any(said in doubt for doubt in self.run.info.get("doubts", ()))
+
+    def frame(self, i: int) -> Frame:
+        """Image i of the sequence, its depth moved onto its colour where the run had to do so."""
+        frame = self.sequence.frame(i)
+        if not i or not self._apart:
+            return frame
+        lag = DepthLag()
+        lag.off_px = 1.0  # small offsets count, too
+        lag.moved(self.sequence.frame(i - 1))
+        depth_m = lag.moved(frame)
+        return frame if depth_m is None else replace(frame, depth_m=depth_m)
 
     @cached_property
     def _coarse(self) -> Mapping[str, Any]:

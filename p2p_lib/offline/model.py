@@ -102,7 +102,7 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     camera = made.sequence.camera
     render = Renderer(surface.vertices, surface.faces, camera)
     views = texture.chosen_rows(made, name, kept, render)
-    seen = [(T, made.sequence.frame(view.frame).depth_m) for view in views[::3] for T in [view.T_cam_obj]]
+    seen = [(T, made.frame(view.frame).depth_m) for view in views[::3] for T in [view.T_cam_obj]]
     shape = whole(cleaned(surface), faces, camera, seen)
     textured = with_texture(shape, views, camera)
     out.mkdir(parents=True)

@@ -30,7 +30,7 @@ def fused(made: Finished, name: str, T: np.ndarray, rows: np.ndarray, config: Co
     """The surface that the frames ``rows`` show at poses T (n, 4, 4)."""
     volume = TsdfVolume(replace(config.tsdf, voxel_m=voxel_m))
     for k in rows:
-        frame = made.sequence.frame(int(made.frames[k]))
+        frame = made.frame(int(made.frames[k]))
         if (mask := made.masks(frame.index).get(name)) is not None:
             use = mask & off_edges(frame.depth_m, STEP_M) & in_range(frame.depth_m, config.depth)
             volume.integrate(frame.depth_m, frame.rgb, use, made.sequence.camera, se3.orthonormalised(T[k]))

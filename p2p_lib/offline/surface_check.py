@@ -67,7 +67,7 @@ class SurfaceCheck:
         self._usual = float(np.median(usual)) if usual else 0.0
 
     def _frame(self, k: int) -> Frame:
-        return self._made.sequence.frame(int(self._made.frames[k]))
+        return self._made.frame(int(self._made.frames[k]))
 
     def found(self, k: int, candidates: list[np.ndarray], near: int, T_near: np.ndarray) -> FittedPose | None:
         """The best pose of the k-th frame; None where the surface is not seen from any of these.

@@ -1,6 +1,7 @@
 """Depth of another moment than its colour is moved onto it, and depth of the same moment stays where it is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.extended.default import MECHANISMS, compose
 from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
+from p2p_lib.offline.finished import Finished
 
 W, H, FAR_M, NEAR_M = 640, 480, 1.5, 0.9
 
@@ -129,3 +131,21 @@ def test_it_is_a_mechanism():
             with pytest.warns(Doubt, match="different moments"):
                 assert before(frames[1][0]) is not frames[1][0]
     assert "lag" in MECHANISMS
+
+
+def test_what_is_made_of_a_run_takes_depth_as_the_run_did():
+    class Film:
+        """The sequence of a run."""
+
+        def frame(self, i: int) -> Frame:
+            """As the camera took it."""
+            return frames[i][0]
+
+    frames = film(30, 0, 1)
+    for doubts, moved in (([], False), (["depth and colour: of different moments while the camera moves, 9 px"], True)):
+        made = Finished(SimpleNamespace(info={"doubts": doubts}), Film())
+        for i, (frame, now) in enumerate(frames):
+            if moved and i:
+                assert wrong(made.frame(i).depth_m, now) < 0.25 * wrong(frame.depth_m, now)
+            else:
+                assert made.frame(i) is frame
