@@ -68,7 +68,9 @@ class DepthLag:
     def _motion(self, rgb: np.ndarray) -> np.ndarray | None:
         """(2, 3) how far the image has moved at a pixel (u, v, 1) since the frame before; None where nothing tells."""
         height, width = rgb.shape[:2]
-        small = (_FLOW_PX, max(1, round(height * _FLOW_PX / width)))
+        small = (_FLOW_PX, round(height * _FLOW_PX / width))
+        if small[1] < _STRIDE_PX:
+            return None  # a strip
         gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), small, interpolation=cv2.INTER_AREA)
         before, self._before = self._before, gray
         if before is None or before.shape != gray.shape or cv2.absdiff(before, gray).mean() < _STILL:

@@ -91,6 +91,8 @@ def test_what_tells_nothing_moves_nothing():
     lag, (first, second, *_) = DepthLag(), (frame for frame, _ in film(30, 0, 1))
     assert lag.moved(first) is None
     assert lag.moved(replace(second, depth_m=np.ones_like(second.depth_m))) is None, "no step of depth"
+    for strip in (np.s_[:20], np.s_[:, :20]):
+        assert lag.moved(Frame(2, 0.1, first.rgb[strip].copy(), first.depth_m[strip].copy())) is None
     half = Frame(2, 0.1, first.rgb[::2].copy(), first.depth_m[::2].copy())
     assert lag.moved(half) is None, "of another size than the one before"
     for frame, _ in film(40, 0, 1):
