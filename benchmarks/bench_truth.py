@@ -80,7 +80,8 @@ class Corners:
 def pose(camera: Camera, p: np.ndarray, uv_px: np.ndarray, start: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
     """T (4, 4) that takes points (K, 3) into the camera, and which (K,) agree; by RANSAC, or from a start."""
     if start is None:
-        found = cv2.solvePnPRansac(p, uv_px, camera.K, None, None, None, False, 2000, _AGREE_PX[1], 0.9999)
+        how = {"iterationsCount": 1000, "reprojectionError": _AGREE_PX[1], "flags": cv2.SOLVEPNP_EPNP}
+        found = cv2.solvePnPRansac(p, uv_px, camera.K, None, **how)
         start = se3.from_rt(cv2.Rodrigues(found[1])[0], found[2].ravel())
     turn, place = cv2.Rodrigues(start[:3, :3])[0], start[:3, 3:].copy()
     for within_px in _AGREE_PX:
