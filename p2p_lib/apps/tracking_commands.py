@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import partial
@@ -108,7 +108,7 @@ def _run(a: argparse.Namespace) -> int:
     print("\n".join([*result.summary, *that_fit(lengths(a.out, known_m)), *_without_map(a.out)]))
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
-        print("\n".join([title, *(f"  {line}" for line in result.look_at)]))
+        print("\n".join([title, *(f"  {line}" for line in said_once(result.look_at))]))
     first = a.out / FIRST_MASKS
     results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:
@@ -125,6 +125,18 @@ def _run(a: argparse.Namespace) -> int:
     if result.advice:
         warn(f"p2p run: {result.advice}")
     return 0 if result.tracked else P2PError.exit_code
+
+
+def said_once(lines: Iterable[str]) -> list[str]:
+    """What is said of objects, what is said of several in one line.
+
+    >>> said_once(["cup: far away", "can: blurred", "can: far away"])
+    ['cup, can: far away', 'can: blurred']
+    """
+    names: dict[str, list[str]] = {}
+    for name, _, text in (line.partition(": ") for line in lines):
+        names.setdefault(text, []).append(name)
+    return [f"{', '.join(of)}: {text}" for text, of in names.items()]
 
 
 def _check_as_before(folder: Path, out: Path, options: RunOptions) -> None:
