@@ -345,16 +345,16 @@ def _registered(frames: list[Frame], pairs: list[tuple[Frame, Frame]]) -> Findin
     if found is None:
         fix = "Be sure that the camera's software aligns them: what is not aligned gives poses that are wrong or lost."
         return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree", fix)
-    for before, after in pairs if found.doubt is None else ():
+    if found.doubt is not None:
+        text, fix = found.doubt
+        return Finding(name, Level.WRONG, f"depth is {text}", fix)
+    for before, after in pairs:
         lag = DepthLag()
         lag.moved(before)
         if lag.moved(after) is not None:
             text, fix = lag.doubt
             return Finding(name, Level.LOOK, f"depth and colour are {text} in frame {after.index}", fix)
-    if found.doubt is None:
-        return Finding(name, Level.OK, "edges of depth lie on edges of colour")
-    text, fix = found.doubt
-    return Finding(name, Level.WRONG, f"depth is {text}", fix)
+    return Finding(name, Level.OK, "edges of depth lie on edges of colour")
 
 
 def _no_masks(sequence: Sequence, drawn: bool, config: Config) -> Finding:

@@ -27,7 +27,7 @@ from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
 from p2p_lib.synthetic.faults import Faulty
-from tests.extended.test_depth_lag import film
+from tests.fixtures.late_depth import film
 
 CAMERA = open_sequence("synthetic/crossing").camera
 

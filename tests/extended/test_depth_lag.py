@@ -3,7 +3,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,45 +10,11 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import Doubt
 from p2p_lib.core.types import Frame
-from p2p_lib.extended.default import MECHANISMS, compose
+from p2p_lib.extended.default import compose
 from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.offline.finished import Finished
-
-W, H, FAR_M, NEAR_M = 640, 480, 1.5, 0.9
-
-
-def panorama() -> tuple[np.ndarray, np.ndarray]:
-    """A printed wall with cards before it: colour (h, w, 3) uint8 and depth (h, w), three images high and wide."""
-    rng = np.random.default_rng(0)
-    print_ = cv2.GaussianBlur(rng.normal(0, 60, (3 * H, 3 * W)).astype(np.float32), (0, 0), 3)
-    depth = np.full(print_.shape, FAR_M, np.float32)
-    for left, top in rng.integers(0, [3 * W - 60, 3 * H - 45], (600, 2)):
-        card = np.s_[top : top + 45, left : left + 60]
-        print_[card] += rng.choice([-60, 60])
-        depth[card] = NEAR_M
-    gray = np.clip(print_ + 120 + rng.normal(0, 2, print_.shape), 0, 255).astype(np.uint8)
-    return np.repeat(gray[..., None], 3, 2), depth
-
-
-RGB, DEPTH = panorama()
-
-
-def view(px: float, roll_deg: float, image: np.ndarray) -> np.ndarray:
-    """What a camera shows of it, moved by (px, px / 3) from the middle and turned about its axis."""
-    centre = 1.5 * np.array([W, H])
-    onto = cv2.getRotationMatrix2D(centre.tolist(), roll_deg, 1)
-    onto[:, 2] -= centre - np.array([W, H]) / 2 + np.array([px, px / 3])
-    return cv2.warpAffine(image, onto, (W, H), flags=cv2.INTER_NEAREST)
-
-
-def film(px: float, roll_deg: float, late: float, frames: int = 6) -> list[tuple[Frame, np.ndarray]]:
-    """Frames of a camera that moves by so much from each to the next, depth being late by so many; its depth now."""
-    shown = []
-    for k in range(frames):
-        depth = view(px * (k - late), roll_deg * (k - late), DEPTH)
-        shown.append((Frame(k, k / 30, view(px * k, roll_deg * k, RGB), depth), view(px * k, roll_deg * k, DEPTH)))
-    return shown
+from tests.fixtures.late_depth import FAR_M, H, W, film
 
 
 def wrong(depth: np.ndarray, now: np.ndarray) -> float:
@@ -92,7 +57,8 @@ def test_what_tells_nothing_moves_nothing():
     assert lag.moved(first) is None
     assert lag.moved(replace(second, depth_m=np.ones_like(second.depth_m))) is None, "no step of depth"
     for strip in (np.s_[:20], np.s_[:, :20]):
-        assert lag.moved(Frame(2, 0.1, first.rgb[strip].copy(), first.depth_m[strip].copy())) is None
+        parts = [Frame(f.index, f.time_s, f.rgb[strip].copy(), f.depth_m[strip].copy()) for f in (first, second)]
+        assert [lag.moved(part) for part in parts] == [None, None], "too narrow"
     half = Frame(2, 0.1, first.rgb[::2].copy(), first.depth_m[::2].copy())
     assert lag.moved(half) is None, "of another size than the one before"
     for frame, _ in film(40, 0, 1):
@@ -132,7 +98,6 @@ def test_it_is_a_mechanism():
         else:
             with pytest.warns(Doubt, match="different moments"):
                 assert before(frames[1][0]) is not frames[1][0]
-    assert "lag" in MECHANISMS
 
 
 def test_what_is_made_of_a_run_takes_depth_as_the_run_did():
