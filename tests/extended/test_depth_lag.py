@@ -52,6 +52,18 @@ def test_of_a_camera_that_takes_them_apart_small_offsets_are_undone_too():
             assert depth is not None and wrong(depth, now) < 0.3 * wrong(frame.depth_m, now)
 
 
+def test_what_fits_hardly_better_elsewhere_stays():
+    lag = DepthLag()
+    lag.off_px = 20.0  # known to take them apart
+    assert [lag.moved(frame) for frame, _ in film(16, 0, 0.07)] == [None] * 6
+
+
+def test_of_a_camera_that_stands_still_no_motion_is_asked():
+    lag = DepthLag()
+    lag._flow = None
+    assert [lag.moved(frame) for frame, _ in film(0, 0, 0)] == [None] * 6
+
+
 def test_what_tells_nothing_moves_nothing():
     lag, (first, second, *_) = DepthLag(), (frame for frame, _ in film(30, 0, 1))
     assert lag.moved(first) is None
