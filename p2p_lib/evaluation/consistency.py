@@ -131,12 +131,13 @@ def consistency(
     masks, every = load_masks(run.path), load_run(run.path, every_map=True)
     sizes = {name: of.doubt for name, of in lengths(run.path, known_m or {}).items() if of.doubt}
     objects, found, unknown = {}, {}, {}
+    doubted = run.info.get("doubts") or ()
     for name, whole in run.objects.items():
         rows = whole.followed if whole.followed.any() else np.ones(len(whole), bool)
         obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
-        fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks)
-        doubts = tuple(text for text in run.info.get("doubts") or () if _is_about(text, name))
+        fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, doubted)
+        doubts = tuple(text for text in doubted if _is_about(text, name))
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
         evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts, moved)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()

@@ -27,6 +27,7 @@ from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.evaluation.suspicions import FEW, RunEvidence
+from p2p_lib.extended.depth_lag import as_the_run_took
 
 #: As near to the surface is on it, or as near as depth is noisy there; so much before it, or twice that, is something
 #: else that hides it.
@@ -53,9 +54,17 @@ class SurfaceFit:
 
 
 def surface_in_view(
-    obj: ObjectRun, sequence: Sequence | None, mesh: Path, masks: ObjectMasks | None, looks: int
+    obj: ObjectRun,
+    sequence: Sequence | None,
+    mesh: Path,
+    masks: ObjectMasks | None,
+    looks: int,
+    doubts: Collection[str] = (),
 ) -> SurfaceFit:
-    """An object's surface at its poses, at every :data:`~p2p_lib.datasets.mask_log.CELLS` pixel of some frames."""
+    """An object's surface at its poses, at every :data:`~p2p_lib.datasets.mask_log.CELLS` pixel of some frames.
+
+    doubts  of the run: depth is looked at where the run moved it to
+    """
     fit = SurfaceFit(*np.full((3, len(obj)), np.nan))
     if sequence is None or not looks or not mesh.is_file():
         return fit
@@ -67,7 +76,7 @@ def surface_in_view(
         if not obj.has_pose[row]:
             continue
         index = int(obj.frame_index[row])
-        depth_m = sequence.frame(index).depth_m[CELLS]
+        depth_m = as_the_run_took(sequence, index, doubts).depth_m[CELLS]
         surface_m = drawn_m(scene, sequence.camera, obj.T_cam_obj[row], CELLS)
         fit.on_surface[row], fit.through[row] = on_surface(surface_m, depth_m), _through(surface_m, depth_m)
         at = masks.row(index) if masks is not None else None

@@ -7,6 +7,8 @@ that one number is looked for: after which share of that way do steps of depth l
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -14,6 +16,7 @@ import numpy as np
 
 from p2p_lib.core.depth_edges import brightness_edges, near_sides
 from p2p_lib.core.types import Frame
+from p2p_lib.datasets.sequence import Sequence
 
 #: Widths of the images in which the camera's motion, and the offset of depth, are looked for, px.
 _FLOW_PX, _EDGES_PX = 160, 320
@@ -84,6 +87,21 @@ class DepthLag:
         motion, scale = found - np.eye(2, 3), width / _FLOW_PX
         motion[:, 2] = scale * motion[:, 2] - motion[:, :2].sum(1) * (scale - 1) / 2
         return motion
+
+
+def as_the_run_took(sequence: Sequence, i: int, doubts: Iterable[str]) -> Frame:
+    """Frame i of a run's sequence, its depth moved onto its colour where the run had to do so.
+
+    doubts  of the run (``run.json``)
+    """
+    frame, lag = sequence.frame(i), DepthLag()
+    apart = lag.doubt[0].partition(",")[0]
+    if not i or not any(apart in doubt for doubt in doubts):
+        return frame
+    lag.off_px = 1.0  # small offsets count, too
+    lag.moved(sequence.frame(i - 1))
+    depth_m = lag.moved(frame)
+    return frame if depth_m is None else replace(frame, depth_m=depth_m)
 
 
 def _late(frame: Frame, per_frame: np.ndarray) -> float:

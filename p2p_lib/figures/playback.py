@@ -21,6 +21,7 @@ from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import LIVE, Sequence, reopen
 from p2p_lib.evaluation.evidence import drawn_m
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
+from p2p_lib.extended.depth_lag import as_the_run_took
 from p2p_lib.figures import style
 
 if TYPE_CHECKING:
@@ -125,7 +126,9 @@ class Playback:
 
     def frame(self, i: int) -> Frame | None:
         """The image of row i, where it can still be had."""
-        return None if self.sequence is None else self.sequence.frame(int(self.frame_index[i]))
+        if self.sequence is None:
+            return None
+        return as_the_run_took(self.sequence, int(self.frame_index[i]), self.run.info.get("doubts") or ())
 
     def cloud(self, i: int, frame: Frame, points: int) -> tuple[np.ndarray, np.ndarray]:
         """About so many points (M, 3) of the frame of row i in camera coordinates, on a grid, and their colours (M, 3).

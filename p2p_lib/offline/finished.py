@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from p2p_lib.datasets.mask_log import CELL_PX, load_masks
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
-from p2p_lib.extended.depth_lag import DepthLag
+from p2p_lib.extended.depth_lag import as_the_run_took
 
 #: The one rule of what is labelled; ``{0}`` is the least confidence.
 RULE = (
@@ -88,22 +88,9 @@ class Finished:
         """(n,) frame numbers of the sequence that the run is over."""
         return next(iter(self.run.objects.values())).frame_index
 
-    @cached_property
-    def _apart(self) -> bool:
-        """Whether the run found that its camera takes depth and colour at different moments."""
-        said = DepthLag().doubt[0].partition(",")[0]
-        return any(said in doubt for doubt in self.run.info.get("doubts", ()))
-
     def frame(self, i: int) -> Frame:
         """Image i of the sequence, its depth moved onto its colour where the run had to do so."""
-        frame = self.sequence.frame(i)
-        if not i or not self._apart:
-            return frame
-        lag = DepthLag()
-        lag.off_px = 1.0  # small offsets count, too
-        lag.moved(self.sequence.frame(i - 1))
-        depth_m = lag.moved(frame)
-        return frame if depth_m is None else replace(frame, depth_m=depth_m)
+        return as_the_run_took(self.sequence, i, self.run.info.get("doubts", ()))
 
     @cached_property
     def _coarse(self) -> Mapping[str, Any]:

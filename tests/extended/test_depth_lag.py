@@ -5,16 +5,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import Doubt
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import Frame, PoseEstimate, Status
+from p2p_lib.datasets.runs import ObjectRun
+from p2p_lib.evaluation.evidence import surface_in_view
 from p2p_lib.extended.default import compose
 from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
+from p2p_lib.figures.playback import Playback
 from p2p_lib.offline.finished import Finished
-from tests.fixtures.late_depth import FAR_M, H, W, film
+from tests.fixtures.late_depth import FAR_M, NEAR_M, H, W, film
 
 
 def wrong(depth: np.ndarray, now: np.ndarray) -> float:
@@ -112,19 +116,42 @@ def test_it_is_a_mechanism():
                 assert before(frames[1][0]) is not frames[1][0]
 
 
-def test_what_is_made_of_a_run_takes_depth_as_the_run_did():
-    class Film:
-        """The sequence of a run."""
+class Film:
+    """The sequence of a run whose camera is a frame late with its depth."""
 
-        def frame(self, i: int) -> Frame:
-            """As the camera took it."""
-            return frames[i][0]
+    camera = Camera(525.0, 525.0, (W - 1) / 2, (H - 1) / 2, W, H)
+    frames, now = zip(*film(30, 0, 1), strict=True)
 
-    frames = film(30, 0, 1)
-    for doubts, moved in (([], False), (["depth and colour: of different moments while the camera moves, 9 px"], True)):
-        made = Finished(SimpleNamespace(info={"doubts": doubts}), Film())
-        for i, (frame, now) in enumerate(frames):
+    def frame(self, i: int) -> Frame:
+        """As the camera took it."""
+        return self.frames[i]
+
+
+SAID = [], ["depth and colour: of different moments while the camera moves, 9 px"]
+
+
+@pytest.mark.parametrize("of", [Finished, lambda run, film: Playback(run, film, {})], ids=["offline", "drawn"])
+def test_what_is_made_or_drawn_of_a_run_takes_depth_as_the_run_did(of):
+    for doubts, moved in zip(SAID, (False, True), strict=True):
+        of_all = {"": SimpleNamespace(frame_index=np.arange(6))}
+        made = of(SimpleNamespace(info={"doubts": doubts}, objects=of_all), Film())
+        for i, (frame, now) in enumerate(zip(Film.frames, Film.now, strict=True)):
             if moved and i:
                 assert wrong(made.frame(i).depth_m, now) < 0.25 * wrong(frame.depth_m, now)
             else:
                 assert made.frame(i) is frame
+
+
+def test_a_run_is_judged_by_depth_as_it_took_it(tmp_path):
+    """The cards before the wall, at their true places, are an object's surface."""
+    uv = np.argwhere(Film.now[3] == NEAR_M)[:, ::-1]
+    corners = Film.camera.unproject(
+        (uv[:, None] + [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]).reshape(-1, 2),
+        np.full(4 * len(uv), NEAR_M),
+    )
+    faces = (4 * np.arange(len(uv))[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3)
+    trimesh.Trimesh(corners, faces, process=False).export(tmp_path / "cards.ply")
+    seen = PoseEstimate("cards", 3, 0.1, Status.TRACKED, np.eye(4), 1.0)
+    cards = ObjectRun.of("cards", [seen], SimpleNamespace(truth={}), [None])
+    late, moved = (surface_in_view(cards, Film(), tmp_path / "cards.ply", None, 1, said).on_surface[0] for said in SAID)
+    assert late < 0.75 and moved > 0.9
