@@ -26,7 +26,7 @@ from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera
-from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size
+from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size, uncounted
 from p2p_lib.datasets.exchange import as_run, export, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import load_masks
@@ -276,7 +276,7 @@ def _doubt_camera(job: _Job) -> None:
 
 
 def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None], known_m: Container[str]) -> set[str]:
-    """Warn of objects that are where depth does not count, and of those of odd sizes, unless they are known.
+    """Warn of objects where depth does not count; unless a size is known, of those far away, or of odd sizes, too.
 
     Returns those whose mask and its depth tell, in range or not.
     A run goes on without a pose then, as where a unit is another, and would say so at its end only.
@@ -286,10 +286,14 @@ def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None]
     away_m = {name: m for name, mask in large.items() if np.isfinite(m := distance_m(frame, mask))}
     out_m = {name: m for name, m in away_m.items() if in_range(frame.depth_m[large[name]], limits).mean() < _HARDLY}
     scale = getattr(job.sequence, "depth_scale", 1.0)
-    if out_m and (wrong := beyond(out_m, limits, scale)):
-        doubt(f"depth of {next(iter(out_m))!r} in frame {frame.index}", *wrong)
-    for name in (name for name in away_m if name not in out_m and name not in known_m):
-        if wrong := odd_size(large[name], away_m[name], job.sequence.camera, scale):
+    rest_m = {name: m for name, m in away_m.items() if name not in out_m and name not in known_m}
+    counted_m = {name: m for name, m in rest_m.items() if not uncounted({name: m}, limits)}
+    far_m = {name: m for name, m in counted_m.items() if beyond({name: m}, limits, scale)}
+    for of in filter(None, (out_m, far_m)):
+        if wrong := beyond(of, limits, scale):
+            doubt(f"depth of {next(iter(of))!r} in frame {frame.index}", *wrong)
+    for name in (name for name in rest_m if name not in far_m):
+        if wrong := odd_size(large[name], rest_m[name], job.sequence.camera, scale):
             doubt(f"size of {name!r} in frame {frame.index}", *wrong)
     return set(away_m)
 

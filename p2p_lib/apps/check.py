@@ -30,7 +30,7 @@ from p2p_lib.core.types import Frame, evenly
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera, sees
-from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size
+from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size, uncounted
 from p2p_lib.datasets.image_sequence import paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
@@ -132,8 +132,11 @@ def check_folder(
     findings.append(_truth(sequence))
     if not firsts:  # of prompts it is said already what is wrong with them
         return findings if prompts else [*findings, _no_masks(sequence, any(masks), config)]
-    if beyond := _beyond(firsts, config, scale):
-        return [*findings, beyond]  # what follows would only be its consequences
+    far = _beyond(firsts, config, scale)
+    if far is not None:
+        findings.append(far)
+        if far.level is Level.WRONG:
+            return findings  # what follows would only be its consequences
     for name, (frame, mask) in firsts.items():
         if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
@@ -143,7 +146,7 @@ def check_folder(
         elif wrong_size := odd_size(mask, distance_m(frame, mask), sequence.camera, scale):
             findings.append(Finding(f"{name}: size", Level.LOOK, *wrong_size))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
-        findings.append(_range(name, frame, mask, config, scale))
+        findings += [_range(name, frame, mask, config, scale)] if far is None else []
         warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
         findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in warned]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
@@ -394,13 +397,15 @@ def _misspelt(name: str, firsts: FirstMasks) -> list[Finding]:
 
 
 def _beyond(firsts: FirstMasks, config: Config, scale: float) -> Finding | None:
-    """The one finding of objects that are all out of range."""
-    wrong = beyond({name: distance_m(*first) for name, first in firsts.items()}, config.depth, scale)
+    """The one finding of objects that are all out of range, or far away."""
+    away_m = {name: distance_m(*first) for name, first in firsts.items()}
+    wrong = beyond(away_m, config.depth, scale)
     if wrong is None:
         return None
     (first, (frame, mask)), *_ = firsts.items()
     text = f"{wrong[0]}; {int(mask.sum())} pixels in frame {frame.index}"
-    return Finding(f"{first}: depth", Level.WRONG, text, wrong[1])
+    level = Level.WRONG if uncounted(away_m, config.depth) else Level.LOOK
+    return Finding(f"{first}: depth", level, text, wrong[1])
 
 
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: float) -> Finding:

@@ -102,7 +102,7 @@ class DepthConfig(_Checked):
     """Of measured depth: which of it is used, and how noisy it is."""
 
     min_m: float = _p(0.1, "Nearer depth is invalid.", "m", "release", low=0)
-    max_m: float = _p(2.5, "Farther depth is invalid.", "m", low=0.1)
+    max_m: float = _p(5.0, "Farther depth is invalid.", "m", low=0.1)
     edge_m: float = _p(0.01, "A larger depth step in the 3x3 neighbourhood is an edge.", "m", "release", low=0)
     narrow: bool = _p(
         True, "Parts of a mask too narrow for a border and whole neighbourhoods keep depth that agrees with theirs."

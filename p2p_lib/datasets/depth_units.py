@@ -8,6 +8,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.image import bounds
 from p2p_lib.core.types import Frame
 
@@ -23,6 +24,8 @@ UNITS_M = {
 }
 #: Where things stand that are tracked, m.
 _STANDS_M = (0.15, 5.0)
+#: So far away hardly anything is tracked, m.
+_FAR_M = 2.5
 #: How long they are, m: a spatula and a keyboard have 0.4, what of a tin looks out behind another one 0.035.
 _LONG_M = (0.02, 0.8)
 #: Fraction of a mask that should have a depth.
@@ -48,18 +51,29 @@ def distance_m(frame: Frame, mask: np.ndarray) -> float:
 def beyond(away_m: Mapping[str, float], limits: DepthConfig, scale: float) -> tuple[str, str] | None:
     """What to say of objects that are all too far away, or all too near, and what to do: most likely a wrong unit.
 
+    Those that are too far, or too near, to count (:func:`uncounted`), and those that are where hardly anything is.
+
     away_m  object to its distance
     scale   metres per unit, as depth was read
     """
     distances, ((_, first_m), *others) = np.array(list(away_m.values())), away_m.items()
-    far = bool((distances > limits.max_m).all())
-    if not far and not (distances < limits.min_m).all():
-        return None
     text = f"{first_m:.2f} m away"
     text += f" ({', '.join(f'{name} {other_m:.2f} m' for name, other_m in others)})" if others else ""
-    text += f", but {limits.min_m:g} to {limits.max_m:g} m count"
-    wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
-    return text, f"If it was, --set depth.{wider}; if it was not, {_wrong_scale(first_m, scale)}"
+    unless = f"if it was not, {_wrong_scale(first_m, scale)}"
+    if uncounted(away_m, limits):
+        far = bool((distances > limits.max_m).all())
+        wider = f"max_m={2 * distances.max():.1f}" if far else f"min_m={distances.min() / 2:.2g}"
+        return f"{text}, but {limits.min_m:g} to {limits.max_m:g} m count", f"If it was, --set depth.{wider}; {unless}"
+    if (distances > _FAR_M).all():
+        off_m = depth_noise_m(distances.max())
+        return f"{text}, where depth is off by about {100 * off_m:.0f} cm", f"If it was, poses are as rough; {unless}"
+    return None
+
+
+def uncounted(away_m: Mapping[str, float], limits: DepthConfig) -> bool:
+    """Whether all objects are too far away, or all too near, for their depth to count."""
+    distances = np.array(list(away_m.values()))
+    return bool((distances > limits.max_m).all() or (distances < limits.min_m).all())
 
 
 def odd_size(mask: np.ndarray, away_m: float, camera: Camera, scale: float) -> tuple[str, str] | None:

@@ -24,6 +24,7 @@ from p2p_lib.datasets.image_sequence import WRITE_K
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, prompts_in
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.run import run
 from p2p_lib.synthetic.faults import Faulty
@@ -61,7 +62,7 @@ EXPECTED = {
         r"--depth-scale .*\. A unit of 0\.001 \(millimetres\)",
     ),
     "a moving scale": ("scale", Level.WRONG, r"all depth changes by \d+ % from frame \d to \d", "as the camera"),
-    "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 2\.5 m count", "the depth scale is wrong"),
+    "ten times as far": ("box: depth", Level.WRONG, r"6\.\d+ m away.*0\.1 to 5 m count", "the depth scale is wrong"),
     "depth not registered": ("registration", Level.WRONG, r"0\.7\d times as large", "Register depth to colour"),
     "depth shifted": ("registration", Level.WRONG, r"shifted by \(\+1[6-9]|\(\+20, [+-]0\) px", "Register depth"),
     "K of another resolution": ("camera", Level.WRONG, r"images of about 128\dx96\d", r"first two rows times 0\.5\."),
@@ -356,24 +357,33 @@ def scaled_depth(folder, factor):
 
 @pytest.mark.parametrize(
     ("factor", "limit", "scale"),
-    [(0.1, "depth.min_m=0.03", "0.01 (centimetres)"), (5, "depth.max_m=7", "0.0002 (TUM RGB-D)")],
+    [
+        (0.1, "depth.min_m=0.03", "0.01 (centimetres)"),
+        (5, "poses are as rough", "0.0002 (TUM RGB-D)"),
+        (10, "depth.max_m=13.9", "0.0002 (TUM RGB-D)"),
+    ],
 )
-def test_objects_all_out_of_range_are_one_finding(good, tmp_path, factor, limit, scale):
-    (wrong,) = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
+def test_objects_all_out_of_range_or_far_are_one_finding(good, tmp_path, factor, limit, scale):
+    found = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
+    (wrong,) = (finding for finding in found if finding.name.endswith(": depth"))
     assert wrong.name == "box: depth" and "(can " in wrong.text
+    assert wrong.level is (Level.LOOK if factor == 5 else Level.WRONG) and (factor == 5 or found == [wrong])
     assert limit in wrong.fix and scale in wrong.fix
 
 
-@pytest.mark.parametrize("times", [1, 5])
+@pytest.mark.parametrize("times", [1, 10])
 def test_without_objects_depth_out_of_range_is_looked_at(good, tmp_path, times):
     folder = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), times)
     shutil.rmtree(folder / "masks")
     (found,) = (finding for finding in check_folder(folder) if finding.name == "depth")
     assert found.level is (Level.OK if times == 1 else Level.LOOK)
-    assert times == 1 or ("between 0.1 and 2.5 m, which count" in found.text and "--set depth.max_m" in found.fix)
+    assert times == 1 or ("between 0.1 and 5 m, which count" in found.text and "--set depth.max_m" in found.fix)
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1, None), (0.1, "0.01 (centimetres)"), (5, "0.0002 (TUM RGB-D)")])
+@pytest.mark.parametrize(
+    ("factor", "unit"),
+    [(1, None), (0.1, "0.01 (centimetres)"), (5, "0.0002 (TUM RGB-D)"), (10, "0.0002 (TUM RGB-D)")],
+)
 @pytest.mark.parametrize("masks", ["dataset", "clicks"])
 def test_a_run_says_at_its_first_masks_that_depth_is_out_of_range(good, tmp_path, factor, unit, masks):
     """With the units that would bring it into range, as the check does."""
@@ -381,14 +391,15 @@ def test_a_run_says_at_its_first_masks_that_depth_is_out_of_range(good, tmp_path
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         run(folder, tmp_path / "run", masks=masks, stop=1, progress=False)
-    said = [str(doubt.message) for doubt in caught if "m count" in str(doubt.message)]
+    followed = [obj.has_pose.all() for obj in load_run(tmp_path / "run").objects.values()]
+    assert followed == [factor in (1, 5)] * 2, "what is far away is followed, too"
+    said = [str(doubt.message) for doubt in caught if " m away" in str(doubt.message)]
     if unit is None:
         assert not said
     else:
         (line,) = said
-        assert re.match(
-            r"depth of 'box' in frame 0: .* m away \(can .* m\), but 0\.1 to 2\.5 m count\. If it was", line
-        )
+        why = "where depth is off by about [2-4] cm" if factor == 5 else "but 0.1 to 5 m count"
+        assert re.match(rf"depth of 'box' in frame 0: .* m away \(can .* m\), {why}\. If it was", line)
         assert f"(--depth-scale). A unit of {unit}" in line
 
 
@@ -397,7 +408,7 @@ def test_a_mask_that_holds_more_of_what_is_far_behind_tells_nothing_of_units(goo
     folder = shutil.copytree(good, tmp_path / "far")
     depth = cv2.imread(str(folder / "depth/000000.png"), cv2.IMREAD_UNCHANGED)
     on_it = np.argwhere(open_sequence(good).masks(0)["box"])
-    depth[tuple(on_it[: int(share * len(on_it))].T)] = 3000
+    depth[tuple(on_it[: int(share * len(on_it))].T)] = 6000
     cv2.imwrite(str(folder / "depth/000000.png"), depth)
     run(folder, tmp_path / "run", objects=["box"], stop=1, progress=False)
     assert any("m count" in str(doubt.message) for doubt in recwarn) == doubted
@@ -435,7 +446,8 @@ def test_a_wrong_unit_shows_in_an_objects_size_where_its_distance_may_be(good, t
     for sizes, doubted in (({}, True), ({"box": 60}, False)):
         settings = {"depth.min_m": 0.01, "depth.max_m": 10.0}
         run(scaled, tmp_path / f"{doubted}", objects=["box"], stop=1, settings=settings, sizes=sizes, progress=False)
-        assert any("size of 'box' in frame 0" in str(doubt.message) for doubt in recwarn) == doubted
+        said = f"{'size' if times < 1 else 'depth'} of 'box' in frame 0"
+        assert any(said in str(doubt.message) for doubt in recwarn) == doubted
         recwarn.clear()
 
 
