@@ -3,8 +3,9 @@
 It is looked for in the whole image by its landmarks: where enough of them agree on a pose, and the surface shows
 there, it may be. It is claimed to be there once another image alone finds it at the same place: what only resembles it
 in one image is not found twice. Then the segmenter starts from what lies on the surface, and the 2D tracker follows
-the landmarks. A claim that loses its points is renewed by its landmarks, or withdrawn, and nothing is learnt before
-points have confirmed it. Then it is an object like any other, in the frame of its old map. Landmarks of sides that
+the landmarks. From then on it is an object like any other, in the frame of its old map, which grows: of something
+small few landmarks are seen, and new points hold what they have found. A claim that loses its points before enough of
+them have confirmed it is renewed by its landmarks, or withdrawn, with everything learnt since. Landmarks of sides that
 come into view later become keypoints when they are seen.
 """
 
@@ -83,7 +84,7 @@ class Remembered(TwoMaps):
         own.known = Known(own.new_model(), replace(self.policy.life, seen_m2=float(memory.seen_m2)), self._first_map)
         own.known.model.recall(memory)
         self._recalled = own.known.model.revision
-        self.other, self.policy.frozen, self.policy.trusted = None, True, None
+        self.other, self.policy.frozen, self.policy.trusted = None, self.frozen, None
         self._key = np.full(len(memory.p_obj), -1)  # of each landmark that is in the map
         self._since = 0  # frames since landmarks were looked for on it
         self._finds: list[tuple[float, np.ndarray | None]] = []  # the newest looks, until two agree: time_s, T_cam_obj
@@ -257,7 +258,6 @@ class Remembered(TwoMaps):
         if step.estimate.T_cam_obj is not None:
             self._claimed, self._bare = True, step.estimate.inliers < _BARE
             self._borne_out += step.estimate.inliers >= self.config.lifecycle.return_inliers
-            self.policy.frozen = self.frozen or not self._confirmed
         self._since += 1
         T_cam_obj = step.estimate.T_cam_obj if self._since >= _EVERY and self.known.map_id == self._first_map else None
         if T_cam_obj is None or followed >= _ENOUGH or step.estimate.status is Status.DEGRADED or obs.mask is None:
