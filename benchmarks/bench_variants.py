@@ -24,7 +24,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import load_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
-from p2p_lib.evaluation.protocol import evaluate
+from p2p_lib.evaluation.protocol import ObjectScore, evaluate
 from p2p_lib.run import run
 
 VIDEOS = ("desk_fast", "redkitchen_table")
@@ -164,7 +164,8 @@ def main() -> None:
             how = starts(of, next(asked.data.glob(f"**/prompts/{name}.json"), Path()))
             if how is not None:
                 runs = [asked.out / f"{name}_{of.name.replace(' ', '_')}_{seed}" for seed in range(asked.seeds)]
-                rows.append({"video": name, "": of.name, **scored(of, how, runs)})
+                scores = [list(of_seed.values()) for of_seed in tracked(of, [how] * asked.seeds, runs)]
+                rows.append({"video": name, "": of.name, **columns(scores)})
     ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
     seeds = f"0 to {asked.seeds - 1}" if asked.seeds > 1 else "0"
     page = PAGE.format(machine=ran, seeds=seeds, rows=as_markdown(DataFrame(rows)))
@@ -172,12 +173,17 @@ def main() -> None:
     print(page)
 
 
-def scored(of: Varied, how: dict, runs: list[Path]) -> dict[str, object]:
-    """The columns of one variant, tracked into one folder a seed."""
+def tracked(of: Varied, starts: list[dict], runs: list[Path]) -> list[dict[str, ObjectScore]]:
+    """An object's score by its name, of each seed: how it starts, and the folder that it is tracked into."""
     scores = []
-    for seed, out in enumerate(runs):
+    for seed, (how, out) in enumerate(zip(starts, runs, strict=True)):
         run(of, out, seed=seed, if_exists="resume", progress=False, **how)
-        scores.append(list(evaluate(load_run(out)).objects.values()))
+        scores.append(evaluate(load_run(out)).objects)
+    return scores
+
+
+def columns(scores: list[list[ObjectScore]]) -> dict[str, object]:
+    """What is said of some objects, whose scores are given by seed."""
     every = [score for seed in scores for score in seed]
     returns = [event.frames_to_recovery for score in every for event in score.returns]
     late = sum(frames is None or frames > 10 for frames in returns)

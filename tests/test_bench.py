@@ -186,3 +186,17 @@ def test_truth_is_where_a_varied_video_shows_its_objects(load, opening):
                 u, v = of.camera.project(T[None, :3, 3])[0].round().astype(int)
                 assert mask[v, u], f"{of.name}: {name}"
                 assert 0 < T[2, 3] - frame.depth_m[v, u] < 0.1, f"{of.name}: {name}"
+
+
+def test_other_objects_of_a_still_scene_move_as_the_one_that_the_dataset_knows(load, opening):
+    """One is outlined as if nobody knew where it is."""
+    bench, video = load("bench_other_objects"), opening("cluttered_desk", 5)
+    known, other, *_ = video.objects
+    v, u = np.nonzero(video.masks(1)[other])
+    outline = [[u.min(), v.min()], [u.max(), v.min()], [u.max(), v.max()], [u.min(), v.max()]]
+    made_of = {"it": {"points": [[u.mean(), v.mean()]], "outline": outline}}
+    others = bench.Others(video, "others", np.arange(1, 5), made_of=made_of, first=1, of=known)
+    assert others.objects == ("it",) and others.truth["it"].labelled.all() and others.masks(0) is None
+    T_other_it = np.linalg.inv(video.truth[other].T_cam_model[1:]) @ others.truth["it"].T_cam_model
+    np.testing.assert_allclose(T_other_it, np.repeat(T_other_it[:1], 4, 0), atol=1e-4)
+    assert np.linalg.norm(T_other_it[0, :3, 3]) < 0.15
