@@ -276,24 +276,27 @@ def _doubt_camera(job: _Job) -> None:
 
 
 def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None], known_m: Container[str]) -> set[str]:
-    """Warn of objects where depth does not count; unless a size is known, of those far away, or of odd sizes, too.
+    """Warn of objects where depth does not count; unless sizes are known, also if all are far away, and of odd sizes.
 
     Returns those whose mask and its depth tell, in range or not.
     A run goes on without a pose then, as where a unit is another, and would say so at its end only.
     """
     limits, least_px = job.config.depth, job.config.lifecycle.min_mask_px
     large = {name: mask for name, mask in masks.items() if mask is not None and np.count_nonzero(mask) >= least_px}
-    away_m = {name: m for name, mask in large.items() if np.isfinite(m := distance_m(frame, mask))}
-    out_m = {name: m for name, m in away_m.items() if in_range(frame.depth_m[large[name]], limits).mean() < _HARDLY}
+    away_m = {}
+    for name, mask in large.items():
+        if np.isfinite(distance_m(frame, mask)):
+            counts = mask & in_range(frame.depth_m, limits)
+            away_m[name] = distance_m(frame, counts if counts.sum() >= _HARDLY * mask.sum() else mask)
     scale = getattr(job.sequence, "depth_scale", 1.0)
-    rest_m = {name: m for name, m in away_m.items() if name not in out_m and name not in known_m}
-    counted_m = {name: m for name, m in rest_m.items() if not uncounted({name: m}, limits)}
-    far_m = {name: m for name, m in counted_m.items() if beyond({name: m}, limits, scale)}
-    for of in filter(None, (out_m, far_m)):
-        if wrong := beyond(of, limits, scale):
-            doubt(f"depth of {next(iter(of))!r} in frame {frame.index}", *wrong)
-    for name in (name for name in rest_m if name not in far_m):
-        if wrong := odd_size(large[name], rest_m[name], job.sequence.camera, scale):
+    unknown = {name: m for name, m in away_m.items() if name not in known_m}
+    out_m = {name: m for name, m in away_m.items() if uncounted({name: m}, limits)}
+    told = out_m or (unknown if len(unknown) == len(away_m) else {})  # one that is far away beside others is
+    if told and (wrong := beyond(told, limits, scale)):
+        doubt(f"depth of {next(iter(told))!r} in frame {frame.index}", *wrong)
+        unknown = {name: m for name, m in unknown.items() if name not in told}
+    for name, m in unknown.items():
+        if wrong := odd_size(large[name], m, job.sequence.camera, scale):
             doubt(f"size of {name!r} in frame {frame.index}", *wrong)
     return set(away_m)
 

@@ -416,7 +416,8 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: flo
         text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
     text = f"{distance_m(frame, mask):.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    return _beyond({name: (frame, mask)}, config, scale) or Finding(f"{name}: depth", Level.OK, text)
+    wrong = _beyond({name: (frame, mask)}, config, scale)  # one that is far away beside others is
+    return wrong if wrong is not None and wrong.level is Level.WRONG else Finding(f"{name}: depth", Level.OK, text)
 
 
 def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Finding:

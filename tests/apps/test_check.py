@@ -580,3 +580,14 @@ def test_a_wrong_unit_is_told_once(good):
 def test_camera_of_a_telescope_is_no_camera():
     assert check._camera(Camera(600, 600, 320, 240, 640, 480)).level is Level.OK
     assert check._camera(Camera(6000, 6000, 320, 240, 640, 480)).level is Level.WRONG
+
+
+def test_one_that_is_far_away_beside_others_is_and_needs_no_other_unit(good, tmp_path, recwarn):
+    folder = shutil.copytree(good, tmp_path / "far")
+    for path in (folder / "depth").iterdir():
+        depth, mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED), open_sequence(good).masks(int(path.stem))["can"]
+        depth[mask] = np.clip(4.0 * depth[mask], 0, 4000)
+        cv2.imwrite(str(path), depth)
+    assert found(folder, "can: depth").level is Level.OK
+    run(folder, tmp_path / "run", stop=1, progress=False)
+    assert not any(" m away, where depth" in str(doubt.message) for doubt in recwarn)
