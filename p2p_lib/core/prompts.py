@@ -17,6 +17,8 @@ from p2p_lib.core.types import Frame
 
 #: Clicks of one kind on an object in a frame.
 MOST_CLICKS = 1000
+#: What of a box's sides is left out on each side of its middle, as far as depth has to be looked for.
+_MIDDLES = (0.35, 0.2, 0.1)
 #: Of the pixels of two masks so many in both: they are of one object.
 _ONE_OBJECT = 0.9
 
@@ -118,12 +120,14 @@ def check_apart(others: Iterable[Prompt], prompt: Prompt, where: str = "") -> No
 def check_depth(prompt: Prompt, frame: Frame) -> None:
     """Refuse clicks none of which has depth, for they say where in space the object is; a box or mask without any."""
     at = prompt.points_px
-    if len(at) and not np.isfinite(depths_at(at, frame)).any():
-        got = f"{_pixel(at[0])} has no depth in frame {frame.index}"
-        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", "Click next to the hole.")
-    if prompt.box_px is not None and not len(prompt.points_px) and not len(points_in_box(prompt.box_px, frame)):
+    measured = np.isfinite(depths_at(at, frame)).any()
+    if prompt.box_px is not None and not measured and not len(points_in_box(prompt.box_px, frame)):
         got = f"no depth inside it in frame {frame.index}"
-        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels near its centre", "Click on the object.")
+        raise BadInput(f"box around {prompt.name!r}", got, "measured pixels", "Draw it around something with depth.")
+    if prompt.box_px is None and len(at) and not measured:
+        got = f"{_pixel(at[0])} has no depth in frame {frame.index}"
+        fix = "Click next to the hole, or draw a box."
+        raise BadInput(f"clicks on {prompt.name!r}", got, "a pixel with a depth measurement", fix)
     if prompt.mask is not None and prompt.mask.any() and not (frame.depth_m[prompt.mask] > 0).any():
         got = f"no depth inside it in frame {frame.index}"
         raise BadInput(f"mask of {prompt.name!r}", got, "measured pixels", "Give it again in a frame with depth.")
@@ -185,13 +189,20 @@ def _check_clicks(prompt: Prompt, frame: Frame, given: Mapping[str, Prompt]) -> 
 
 
 def points_in_box(box_px: np.ndarray, frame: Frame) -> np.ndarray:
-    """(N, 2) pixels that stand for clicks on what a box (4,) is around: in its middle, the nearer half of them."""
-    share = np.linspace(0.35, 0.65, 5)
-    u, v = box_px[0] + share * (box_px[2] - box_px[0]), box_px[1] + share * (box_px[3] - box_px[1])
-    at = np.clip(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2), 0, np.array(frame.shape[::-1]) - 1)
-    z_m = depths_at(at, frame)
-    at, z_m = at[np.isfinite(z_m)], z_m[np.isfinite(z_m)]
-    return at[z_m <= np.median(z_m)] if len(at) else at
+    """(N, 2) pixels that stand for clicks on what a box (4,) is around: in its middle, the nearer half of them.
+
+    Where the middle has no depth, as of a screen, they are from more of it.
+    """
+    at = np.zeros((0, 2))
+    for margin in _MIDDLES:
+        share = np.linspace(margin, 1 - margin, 5)
+        u, v = box_px[0] + share * (box_px[2] - box_px[0]), box_px[1] + share * (box_px[3] - box_px[1])
+        at = np.clip(np.stack(np.meshgrid(u, v), -1).reshape(-1, 2), 0, np.array(frame.shape[::-1]) - 1)
+        z_m = depths_at(at, frame)
+        at, z_m = at[np.isfinite(z_m)], z_m[np.isfinite(z_m)]
+        if len(at):
+            return at[z_m <= np.median(z_m)]
+    return at
 
 
 def _pixels(what: str, given: Any) -> np.ndarray:

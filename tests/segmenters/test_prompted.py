@@ -216,6 +216,16 @@ def test_a_box_starts_an_object(wrong_px):
     assert iou(found, LEFT) > 0.85
 
 
+@pytest.mark.parametrize("clicks", [(), ((120, 110),)])
+def test_a_box_starts_an_object_whose_middle_has_no_depth(clicks):
+    """As that of a screen; a click on it is one, too."""
+    frame = picture()
+    frame.depth_m[95:125, 105:135] = 0
+    prompt = Prompt("left", points_px=np.reshape(clicks, (-1, 2)), box_px=(90, 80, 150, 140))
+    found = segmenter().segment(frame, [prompt]) == 1
+    assert iou(found, LEFT) > 0.8
+
+
 def test_a_box_that_reaches_beyond_the_image_is_cut_to_it():
     frame = picture(moved=-100)
     found = segmenter().segment(frame, [Prompt("left", box_px=(-40, 75, 52, 145))]) == 1

@@ -105,8 +105,8 @@ class Cutter:
         """From clicks or a box, at several scales, the least doubtful first."""
         cfg, frame, around_px = self.config, self.frame, self.prompt.box_px
         clicks = _measured(self.prompt.points_px, frame)
-        if not len(clicks) and around_px is not None:
-            clicks = points_in_box(around_px, frame)
+        if around_px is not None and not np.isfinite(depths_at(clicks, frame)).any():
+            clicks = np.concatenate([clicks, points_in_box(around_px, frame)])
         z_m = float(np.nanmedian(depths_at(clicks, frame)))
         if around_px is None:
             reach_px = cfg.reach_m * np.array([self.camera.fx, self.camera.fy]) / z_m
