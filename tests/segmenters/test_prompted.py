@@ -208,6 +208,33 @@ def test_one_click_on_an_objects_edge_without_depth_selects_the_object():
     assert iou(found, block) > 0.8
 
 
+def before(frame: Frame, part: np.ndarray, colour: tuple[int, ...], z_m: float = 0.66) -> Frame:
+    """With something else (H, W) bool before it."""
+    rgb, depth_m = frame.rgb.copy(), frame.depth_m.copy()
+    rgb[part], depth_m[part] = colour, z_m
+    return replace(frame, rgb=rgb, depth_m=depth_m)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_a_finger_between_the_clicks_is_not_of_the_object(tilt):
+    """Its hand is beyond them; of a card that is tilted a click is as near as the finger before its far side."""
+    finger = rectangle(112, 40, 126, 125) | rectangle(80, 20, 170, 72)
+    frame = before(picture(), RIGHT, (90, 90, 90), 1.0)  # one card alone
+    frame.depth_m[LEFT] += (tilt * (np.arange(320) - 90) / 60 * np.ones((240, 1)))[LEFT]
+    frame = before(frame, finger, (205, 150, 120), 0.66 + 0.6 * tilt)
+    clicks = Prompt("left", points_px=[[100, 90], [104, 130], [138, 100]])
+    found = segmenter().segment(frame, [clicks]) == 1
+    assert iou(found, LEFT & ~finger) > 0.85 and not found[finger].mean() > 0.1
+
+
+def test_what_ends_between_the_clicks_is_a_part_of_the_object():
+    """As a camera's lens."""
+    knob = rectangle(106, 98, 130, 122)
+    clicks = Prompt("left", points_px=[[100, 90], [98, 130], [142, 110]])
+    found = segmenter().segment(before(before(picture(), RIGHT, (90, 90, 90), 1.0), knob, (30, 30, 30)), [clicks]) == 1
+    assert found[knob].mean() > 0.9 and iou(found, LEFT) > 0.85
+
+
 @pytest.mark.parametrize("wrong_px", [(0, 0, 0, 0), (-4, 3, 5, -2), (2, 2, -2, -2)])
 def test_a_box_starts_an_object(wrong_px):
     """Drawn a little too wide or too tight; what lies outside is not of the object, though nothing parts them."""

@@ -33,6 +33,7 @@ from p2p_lib.segmenters.builtin.start_evidence import (
     by_distance,
     by_shares,
     filled,
+    hiding,
     tolerant,
     unlike,
 )
@@ -115,13 +116,26 @@ class Cutter:
             box = self._room(around_px[:2], around_px[2:])
         moved = replace(self, frame=with_depth_moved(frame, depth_offset_px(frame, box)))
         patch = Patch.of(moved.frame, box, self.camera, cfg)
-        found = [moved._cut_at(scale, patch, clicks, z_m) for scale in _SCALES]
+        hides = moved._hiding(clicks, z_m)
+        found = [moved._cut_at(scale, patch, clicks, z_m, hides) for scale in _SCALES]
         return sorted(found, key=lambda cut: cut.doubtful)
 
-    def _cut_at(self, scale: float, patch: Patch, clicks_px: np.ndarray, z_m: float) -> Cut:
-        """Cut on a wide, coarse patch, then on one that fits, an object ``scale`` times as far across as the clicks."""
+    def _hiding(self, clicks_px: np.ndarray, z_m: float) -> np.ndarray:
+        """(H, W) float32: 1 where something is before the object, between the clicks."""
+        low, high = clicks_px.min(0), clicks_px.max(0)
+        fine = replace(self.config, side_px=2 * self.config.side_px)
+        patch = Patch.of(self.frame, self._room(2 * low - high, 2 * high - low), self.camera, fine)
+        image = np.zeros(self.frame.shape, np.float32)
+        image[patch.box.slices] = patch.up(hiding(patch, Clicked.of(patch, clicks_px, z_m)).astype(np.float32))
+        return image
+
+    def _cut_at(self, scale: float, patch: Patch, clicks_px: np.ndarray, z_m: float, hides: np.ndarray) -> Cut:
+        """Cut on a wide, coarse patch, then on one that fits, an object ``scale`` times as far across as the clicks.
+
+        hides  (H, W) what is known to be before it
+        """
         cfg = self.config
-        clicked = Clicked.of(patch, clicks_px, z_m, scale)
+        clicked = Clicked.of(patch, clicks_px, z_m, scale).hidden_by(patch.down(hides) > 0.5)
         height = Height.of(patch, clicked)
         looks = unlike(patch, height.plane)
         connected = by_connection(patch, clicked, height, looks) + self._nearer_to_others(patch, clicked)
@@ -134,7 +148,7 @@ class Cutter:
         fits = self._room(*patch.ends_px(x > 0.5))
         patch = Patch.of(self.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
         connected = patch.down(there)
-        clicked = Clicked.of(patch, clicks_px, z_m, scale)
+        clicked = Clicked.of(patch, clicks_px, z_m, scale).hidden_by(patch.down(hides) > 0.5)
         height = height.on(patch, clicked)
         clicked = clicked.within(patch.down(other) > 0.5) if height.flat else clicked
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
@@ -224,7 +238,7 @@ class Cutter:
 
     def _nearer_to_others(self, patch: Patch, clicked: Clicked) -> np.ndarray:
         """(h, w) log-odds against pixels nearer to a click that is not on the object than to one on it."""
-        others = patch.dots(self._others_px, 0) & ~clicked.seeds
+        others = (patch.dots(self._others_px, 0) | clicked.hides) & ~clicked.seeds
         if not others.any():
             return np.zeros(patch.shape, np.float32)
         return np.where(patch.nearer(others, clicked.seeds, _LIKE), np.float32(-_NOT_IT), 0)

@@ -26,6 +26,8 @@ from p2p_lib.segmenters.builtin.patch import (
 _EXTENT_M, _LONE_M = 0.03, 0.1
 #: Log-odds between the clicks; right beside them; their loss with each extent of distance; and their least.
 _BETWEEN, _BESIDE, _PER_EXTENT, _FAR = 2.0, 0.8, 2.0, -2.5
+#: What hides an object is this much nearer than the clicks on it, m, and so many times as large as is between them.
+_HIDES_M, _REACHES = 0.005, 2.0
 #: What rises less than this many standard deviations plus this many metres above its support is flat.
 _FLAT_SIGMAS, _FLAT_M = 2.0, 0.003
 #: A plane's fit adds this to the noise of depth, m.
@@ -54,6 +56,7 @@ class Clicked:
     hull      (h, w) bool, their convex hull and the seeds
     extents   (h, w) distance from the hull, in extents of the clicks
     beside    (h, w) bool, what is known to be beside the object, however near to the clicks
+    hides     (h, w) bool, of that what is before the object, between the clicks
     """
 
     centres: np.ndarray
@@ -61,6 +64,7 @@ class Clicked:
     hull: np.ndarray
     extents: np.ndarray
     beside: np.ndarray
+    hides: np.ndarray
 
     @classmethod
     def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float, scale: float = 1.0) -> Clicked:
@@ -73,7 +77,7 @@ class Clicked:
         least_m = _EXTENT_M if len(clicks_px) > 1 else _LONE_M
         extent = scale * max(float(np.ptp(at, 0).max()), least_m * patch.camera.fx / z_m / patch.cell_px)
         away = cv2.distanceTransform((~hull).astype(np.uint8), cv2.DIST_L2, 5)
-        return cls(patch.dots(clicks_px, 0), seeds, hull, away / extent, np.zeros(patch.shape, bool))
+        return cls(patch.dots(clicks_px, 0), seeds, hull, away / extent, *np.zeros((2, *patch.shape), bool))
 
     def within(self, unlike: np.ndarray) -> Clicked:
         """Without what looks like the support, which is most of the hull of a thin thing, unless most clicks do."""
@@ -81,6 +85,11 @@ class Clicked:
             return self
         seeds = self.seeds & unlike | self.centres
         return replace(self, seeds=seeds, hull=self.hull & unlike | seeds, beside=~unlike)
+
+    def hidden_by(self, hides: np.ndarray) -> Clicked:
+        """With something (h, w) bool before it."""
+        hides = hides & self.hull & ~self.centres
+        return replace(self, hull=self.hull & ~hides, beside=self.beside | hides, hides=hides)
 
     def prior_beside(self, connected: np.ndarray) -> np.ndarray:
         """(h, w) log-odds by distance from the clicks; never against pixels whose ``connected`` (h, w) is positive."""
@@ -97,6 +106,33 @@ class Clicked:
     def beyond(self) -> np.ndarray:
         """(h, w) weight in the background's colours before the object is cut out."""
         return (self.extents > min(1.0, self.extents.max() / 2)).astype(np.float32)
+
+
+def hiding(patch: Patch, clicked: Clicked) -> np.ndarray:
+    """(h, w) bool: what is before an object between the clicks on it, as a finger: nearer, and beyond a step of depth.
+
+    What ends between the clicks, as a camera's lens, is a part of it.
+    """
+    measured = patch.depth_m > 0
+    at = np.nonzero(clicked.centres & measured)
+    if not len(at[0]):
+        return np.zeros(patch.shape, bool)
+    own = components_touching(connected_components(clicked.hull & patch.smooth), clicked.seeds & patch.smooth)
+    own = dilated(own, 1) | clicked.seeds
+    nearer = clicked.hull & measured & ~own & (patch.depth_m < _through(at, patch.depth_m[at], patch.shape) - _HIDES_M)
+    part = connected_components(patch.smooth & ~own)
+    inside, whole = (np.bincount(part[where], minlength=part.max() + 1) for where in (nearer, part > 0))
+    return nearer & (whole > _REACHES * inside)[part] & (part > 0)
+
+
+def _through(at: tuple[np.ndarray, ...], z_m: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(h, w) depth of the plane through cells ``at``; of less than three, or in a line, the least of theirs."""
+    known = np.stack([*at, np.ones(len(z_m))], -1)
+    if np.linalg.matrix_rank(known - known.mean(0), tol=1.0) < 2:
+        return np.full(shape, z_m.min())
+    of = np.linalg.lstsq(known, 1 / z_m, rcond=None)[0]
+    v, u = np.indices(shape)
+    return 1 / np.clip(of[0] * v + of[1] * u + of[2], 0.02, None)
 
 
 @dataclass(frozen=True, eq=False)
