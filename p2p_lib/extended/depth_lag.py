@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from p2p_lib.core.depth_edges import brightness_edges, near_sides
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import Sequence
+
+if TYPE_CHECKING:
+    from p2p_lib.datasets.sequence import Sequence
 
 #: Widths of the images in which the camera's motion, and the offset of depth, are looked for, px.
 _FLOW_PX, _EDGES_PX = 160, 320

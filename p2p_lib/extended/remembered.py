@@ -281,8 +281,8 @@ class Remembered(TwoMaps):
         return False
 
     def _turned_over(self, obs: OurObservation) -> bool:
-        """No second map where the map does not grow."""
-        return not self.policy.frozen and super()._turned_over(obs)
+        """No second map where the map does not grow, nor before points have confirmed what was found."""
+        return self._confirmed and not self.frozen and super()._turned_over(obs)
 
 
 def _certain(landmarks: float, share: float, outline: float, steps: Callable[[], float | None]) -> bool:
