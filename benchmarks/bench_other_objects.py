@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.sequence import ObjectTruth, open_sequence
 
-SCENES = Path(__file__).with_suffix("").parent / "other_objects.toml"
+SCENES = Path(__file__).parent / "other_objects.toml"
 #: An object's points are within this of the middle depth inside its outline, m; so many of them are scored with.
 _DEEP_M, _POINTS = 0.12, 1500
 #: It is to be seen where this share of its points is in the image, and of these this share not behind something that
@@ -49,19 +51,22 @@ and highest; *lost*: frames in which it is to be seen and has no pose; *found ag
 class Others(Varied):
     """Objects of a scene ``made_of`` clicks and outlines; ``first`` is the frame that these are of."""
 
-    made_of: dict[str, Any] | None = None
+    made_of: Mapping[str, Any] = field(default_factory=dict)
     first: int = 0
     of: str = ""
-    objects: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        assert self.made_of is not None
-        object.__setattr__(self, "objects", tuple(self.made_of))
-        object.__setattr__(self, "_points", {name: self._outlined(one) for name, one in self.made_of.items()})
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """All that were clicked on."""
+        return tuple(self.made_of)
+
+    @cached_property
+    def _points(self) -> dict[str, np.ndarray]:
+        return {name: self._outlined(one) for name, one in self.made_of.items()}
 
     def _outlined(self, one: dict[str, Any]) -> np.ndarray:
         """(N, 3) points of an object in the camera frame of the first frame."""
-        depth_m, inside = self.original.frame(self.first).depth_m, np.zeros((*self._shape,), np.uint8)
+        depth_m, inside = self.original.frame(self.first).depth_m, np.zeros(self._shape, np.uint8)
         cv2.fillPoly(inside, [np.array(one["outline"], np.int32)], 1)
         middle_m = np.median(depth_m[(inside > 0) & (depth_m > 0)])
         v, u = np.nonzero((inside > 0) & (np.abs(depth_m - middle_m) < _DEEP_M))
