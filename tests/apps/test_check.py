@@ -591,3 +591,10 @@ def test_one_that_is_far_away_beside_others_is_and_needs_no_other_unit(good, tmp
     assert found(folder, "can: depth").level is Level.OK
     run(folder, tmp_path / "run", stop=1, progress=False)
     assert not any(" m away, where depth" in str(doubt.message) for doubt in recwarn)
+
+
+def test_of_all_that_are_far_away_one_is_judged_and_a_known_size_says_that_they_are(good, tmp_path, recwarn):
+    folder = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 5)
+    assert [f.name for f in check_folder(folder) if f.name.endswith(": depth")] == ["box: depth"]
+    run(folder, tmp_path / "run", stop=1, sizes={"box": 100.0}, progress=False)
+    assert not any(" m away, where depth" in str(doubt.message) for doubt in recwarn)
