@@ -29,8 +29,9 @@ _POINTS, _FEWEST = 300, 40
 _FACING = -0.25
 #: A measured point this near to the surface is on it, m: while searching, and at the end.
 _ROUGH_M, _FINE_M = 0.02, 0.01
-#: A colour agrees within this distance in CIELAB's a and b (8 bit), and this log-lightness ratio off the mean one.
-_CHROMA, _LIGHTNESS = 20.0, 0.45
+#: A colour agrees within this distance in CIELAB's a and b (8 bit), and this log-lightness ratio off the mean one; a
+#: mean one beyond this is no other exposure: eight times as much light changes it by as much.
+_CHROMA, _LIGHTNESS, _EXPOSED = 20.0, 0.45, 0.75
 #: A measured point is on the surface up to so many standard deviations of its depth, too.
 _SIGMAS = 2.0
 #: A hidden point counts this much against a pose; at least this share of those facing the camera must not be hidden.
@@ -329,6 +330,9 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
                 same = np.sqrt(a * a + b * b) < _CHROMA and abs(lighter[m] - exposure / on) < _LIGHTNESS
                 found[h, m] = same
                 agree += same
+        if on > 0 and abs(exposure / on) > _EXPOSED:
+            agree = 0
+            found[h] = False
         if shown >= fewest and shown >= _SHOWN * facing:
             share[h] = (agree - behind) / max(shown + _HIDDEN * hidden, 1.0)
     return share, found, uv_px

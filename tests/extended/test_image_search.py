@@ -80,6 +80,12 @@ def test_exposure_may_have_changed_colour_not():
     assert search(ball_in_front_of_a_wall((150, 100, 90))).at(PLACE, sample).share < 0.1
 
 
+def test_black_is_not_a_white_of_another_exposure():
+    """Where something black was lifted off a white table, the table has its shape and no colour, either."""
+    assert search(ball_in_front_of_a_wall((20, 20, 20))).at(PLACE, sample_of_the_ball((40, 40, 40))).share > 0.9
+    assert search(ball_in_front_of_a_wall((200, 200, 200))).at(PLACE, sample_of_the_ball((30, 30, 30))).share <= 0
+
+
 def test_what_is_seen_through_is_not_there():
     """Free space contradicts a pose, which counts against it."""
     empty = ball_in_front_of_a_wall(centre=np.array([0.5, 0.0, 0.3]))

@@ -11,7 +11,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import following
 from p2p_lib.segmenters.builtin.cut import by_geometry
-from p2p_lib.segmenters.builtin.motion import Motions, Past, agrees, parts_that_follow, scene_stays
+from p2p_lib.segmenters.builtin.motion import Motions, Past, agrees, free_before, parts_that_follow, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, components_touching, connected_components
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 
@@ -36,10 +36,14 @@ def at(place: tuple[int, int, int, int], moved_m: float = 0.0, z_m: float = PLAT
     return mask
 
 
-def scene(k: int, moved_m: float, camera_m: float = 0.0) -> Frame:
-    """Plate and part moved to the left by so much, and everything by what the camera moved."""
+def scene(k: int, moved_m: float, camera_m: float = 0.0, part_m: float | None = None) -> Frame:
+    """Plate moved to the left by so much, the part too or by ``part_m``, and everything by what the camera moved."""
     rgb, depth = np.roll(_texture(9), -round(CAMERA.fx * camera_m / WALL_M), 1), np.full((240, 320), WALL_M, np.float32)
-    things = (PART, PART_M, 1, moved_m), (NEIGHBOUR, PART_M, 2, 0.0), (PLATE, PLATE_M, 3, moved_m)
+    things = (
+        (PART, PART_M, 1, moved_m if part_m is None else part_m),
+        (NEIGHBOUR, PART_M, 2, 0.0),
+        (PLATE, PLATE_M, 3, moved_m),
+    )
     for place, z_m, seed, own_m in things:
         mask = at(place, own_m + camera_m, z_m)
         shift = -round(CAMERA.fx * (own_m + camera_m) / z_m)
@@ -55,7 +59,7 @@ def left(moved_m: float) -> np.ndarray:
 
 def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
     motion = then, np.linalg.inv(left(moved_m))
-    return Motions(now, motion, motion)
+    return Motions(now, motion, (motion,))
 
 
 def plate_in(patch: Patch, moved_m: float) -> np.ndarray:
@@ -131,10 +135,7 @@ def test_points_agree_with_an_earlier_frame_at_their_depth_and_in_their_colour()
     p_cam = CAMERA.unproject(uv, np.array([PLATE_M, PLATE_M, PLATE_M + 0.1, WALL_M]))
     rgb = then.rgb[uv[:, 1].astype(int), uv[:, 0].astype(int)].copy()
     rgb[1] = 255 - rgb[1] // 4
-    assert [a.tolist() for a in agrees(p_cam, rgb, CAMERA, then, np.eye(4))] == [
-        [True, False, False, True],
-        [False, False, False, False],
-    ]
+    assert agrees(p_cam, rgb, CAMERA, then, np.eye(4)).tolist() == [True, False, False, True]
     far = np.eye(4)
     far[0, 3] = 5.0
     assert not np.any(agrees(p_cam, rgb, CAMERA, then, far))
@@ -157,9 +158,9 @@ def test_what_lies_beside_counts_once_the_masks_are_settled_and_off_the_surface(
     """First masks may still grow; what is on the object's surface is of it, wherever the mask was."""
     told, inner = {}, following.by_geometry
 
-    def by_geometry_noted(patch, seeds, plane, config, motions=None, beside=None):
+    def by_geometry_noted(patch, seeds, plane, config, motions=None, beside=None, free=None):
         told[k] = None if beside is None else bool(beside.any())
-        return inner(patch, seeds, plane, config, motions, beside)
+        return inner(patch, seeds, plane, config, motions, beside, free)
 
     monkeypatch.setattr(following, "by_geometry", by_geometry_noted)
     segmenter = BuiltinSegmenter(CAMERA, CONFIG)
@@ -182,27 +183,54 @@ def test_the_segmenter_takes_in_what_moves_along(part_moves):
     points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
     for k in range(26):
         moved_m = 0.003 * k
-        frame = scene(k, moved_m)
-        T_cam_obj = left(moved_m) if part_moves else left(0.0)
-        hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=T_cam_obj)
+        part_m = moved_m if part_moves else 0.0
+        frame = scene(k, moved_m, part_m=part_m)
+        hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=left(moved_m))
         found = segmenter.segment(frame, () if k else clicks, {"it": hint} if k else None) == 1
-    part, neighbour = at(PART, moved_m, PART_M), at(NEIGHBOUR, 0.0, PART_M)
+    part, neighbour = at(PART, part_m, PART_M) & ~at(PLATE, moved_m), at(NEIGHBOUR, 0.0, PART_M)
     assert found[at(PLATE, moved_m)].mean() > 0.9 and found[neighbour].mean() < 0.05
     assert (found[part].mean() > 0.8) == part_moves
 
 
-def test_what_came_to_the_object_later_is_not_a_part_of_it():
+def test_where_the_wall_was_seen_through_it_is_not_the_object():
     """A hand that takes it moves along from then on; where it is now, the wall was seen in the first frame."""
     moved_m = 0.05
-    then, now = scene(25, 0.0), scene(30, moved_m)
-    before = scene(0, 0.0)
+    then, now, before = scene(25, 0.0), scene(30, moved_m), scene(0, 0.0)
     empty = at(PART, 0.0, PART_M)
     before.rgb[empty], before.depth_m[empty] = _texture(9)[empty], WALL_M
     patch, plate = patch_and_plate(now, moved_m)
     both = motions_of(then, now, moved_m)
-    assert parts_that_follow(patch, connected_components(patch.smooth), plate, both).any()
-    later = Motions(now, both.recent, (before, both.first[1]))
-    assert not parts_that_follow(patch, connected_components(patch.smooth), plate, later).any()
+    later = Motions(now, both.recent, (both.recent, (before, both.recent[1])))
+    part = patch.down((at(PART, moved_m, PART_M) & ~at(PLATE, moved_m)).astype(np.float32)) > 0.9
+    assert not free_before(patch, both)[plate | part].any()
+    free = free_before(patch, later)
+    assert free[part].mean() > 0.7 and not free[plate].any()
+    turned = before.rgb[:, ::-1].copy(), before.depth_m[:, ::-1].copy()  # and from where the camera is no more
+    elsewhere = Motions(now, both.recent, ((Frame(0, 0.0, *turned), both.recent[1]),))
+    assert not free_before(patch, elsewhere).any()
+    inner = cv2.erode(part.astype(np.uint8), np.ones((5, 5))) > 0
+    for what, taken in ((both, True), (later, False)):
+        free = free_before(patch, what)
+        _, component = by_geometry(patch, plate, None, CONFIG, what, free=free)
+        assert component[plate].all() and component[inner].all() == component[inner].any() == taken
+
+
+@pytest.mark.parametrize("on_surface", [False, True])
+def test_what_comes_to_touch_it_is_not_taken_in_unless_it_is_on_its_surface(on_surface):
+    """A block, at the same depth and in its colours."""
+    segmenter = BuiltinSegmenter(CAMERA, CONFIG)
+    clicks = [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
+    points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
+    plate, block = at(PLATE), np.zeros((240, 320), bool)
+    block[118:142, 170:182] = True
+    for k in range(45):
+        frame = scene(k, 0.0)
+        if k >= 36:
+            frame.rgb[block], frame.depth_m[block] = np.roll(_texture(3), 60, 1)[block], PLATE_M
+        hint = Hint(points, np.zeros((240, 320), np.float32) if on_surface else None, np.eye(4))
+        found = segmenter.segment(frame, () if k else clicks, {"it": hint} if k else None) == 1
+    assert found[plate].mean() > 0.9
+    assert (found[block].mean() > 0.9) if on_surface else (found[block].mean() < 0.1)
 
 
 def test_the_first_frame_is_remembered_and_the_newest():
@@ -213,7 +241,8 @@ def test_the_first_frame_is_remembered_and_the_newest():
     kept = [frame.index for frame, _ in past.seen]
     assert kept[0] == 0 and kept[-1] == 55 and len(kept) < 10 and min(np.diff(kept)) >= 5
     motions = past.motions(scene_of_nothing(60), left(0.6))
-    np.testing.assert_allclose(motions.first[1], left(-0.6), atol=1e-12)
+    np.testing.assert_allclose(motions.compared[0][1], left(-0.6), atol=1e-12)
+    assert [then.index for then, _ in motions.compared] == kept and motions.recent in motions.compared[1:]
     then, T_then_now = motions.recent
     np.testing.assert_allclose(T_then_now, left(0.01 * then.index - 0.6), atol=1e-12)
     assert 25 <= then.index <= 55

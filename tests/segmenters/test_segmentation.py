@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depths_at
@@ -441,9 +442,12 @@ class Asked(dict):
 
 
 def sure(**at) -> Asked:
-    """Many points that agree, on cards with these upper left corners."""
+    """Many points that agree, on cards with these upper left corners, which are the objects' origins."""
     points = np.stack(np.meshgrid([10.0, 20, 35, 50], [10, 25, 40]), -1).reshape(-1, 2)
-    return Asked({name: Hint(points + corner, T_cam_obj=np.eye(4)) for name, corner in at.items()})
+    poses = {
+        name: se3.from_rt(np.eye(3), CAMERA.unproject(np.array(c, float), CARD_M + 0.05)) for name, c in at.items()
+    }
+    return Asked({name: Hint(points + corner, T_cam_obj=poses[name]) for name, corner in at.items()})
 
 
 def test_objects_with_sure_poses_are_cut_out_in_turns():

@@ -68,6 +68,7 @@ def by_geometry(
     config: SegmentationConfig,
     motions: Motions | None = None,
     beside: np.ndarray | None = None,
+    free: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence that an object is connected in depth and is not what it stands on.
 
@@ -83,7 +84,7 @@ def by_geometry(
         return log_odds, nothing
     from_seeds_m = np.abs(patch.depth_m - approximate_median(patch.depth_m[at]))
     log_odds[measured & (from_seeds_m > config.reach_m)] -= config.geometry_weight
-    free = patch.smooth
+    smooth = patch.smooth if free is None else patch.smooth & ~free
     if plane is not None:
         height, sigma_m = plane_heights(patch, plane), approximate_median(patch.sigma_m[at])
         above_m = approximate_median(height[at])
@@ -92,8 +93,8 @@ def by_geometry(
         if above_m > 0:
             low = height < min(above_m / 2, max_plane_height_m(sigma_m))
             log_odds[measured & low] -= config.geometry_weight
-            free = free & ~low
-    part = connected_components(free)
+            smooth = smooth & ~low
+    part = connected_components(smooth)
     component = components_touching(part, seeds)
     if beside is not None:
         component &= ~_mostly(part, beside)
@@ -102,7 +103,7 @@ def by_geometry(
         component |= parts
         log_odds[parts] += config.geometry_weight
     # What is as low as the plane has its penalty already: colour can outweigh one.
-    log_odds[measured & ~dilated(component, 1) & (free | ~patch.smooth)] -= config.geometry_weight
+    log_odds[measured & ~dilated(component, 1) & (smooth | ~patch.smooth)] -= config.geometry_weight
     if component[patch.border()].mean() > _AT_THE_BORDER:
         return log_odds, nothing  # it goes on beyond the patch: it is more than this object
     log_odds[component] += config.geometry_weight

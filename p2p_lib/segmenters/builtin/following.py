@@ -10,7 +10,7 @@ import numpy as np
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, strange, warped
-from p2p_lib.segmenters.builtin.motion import scene_stays
+from p2p_lib.segmenters.builtin.motion import free_before, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, keep_seeded_components, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX
 from p2p_lib.segmenters.builtin.target import Target
@@ -76,23 +76,26 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
 
     None if it has left: what shows there lies behind it, or has the surroundings' colours without its points.
     """
-    cfg, patch, prior, jumped = view.config, predicted.patch, predicted.prior, predicted.jumped
+    cfg, patch, prior = view.config, predicted.patch, predicted.prior
     assert target.seen is not None and target.colours is not None  # a frame ago
-    core = (prior > 0.8) & ~(jumped | predicted.shown)
+    T_cam_obj = hint.T_cam_obj if target.confident else None
+    motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
+    surface, free = by_surface(patch, hint, cfg, others), np.zeros(patch.shape, bool)
+    if motions is not None and holds((patch.box, patch.up(prior)), hint.uv_px):
+        free = free_before(patch, motions) & (surface <= 0)
+    foreign = predicted.jumped | free
+    core = (prior > 0.8) & ~(foreign | predicted.shown)
     if not (core & (patch.depth_m > 0)).any():
         core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
     plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
-    T_cam_obj = hint.T_cam_obj if target.confident else None
-    motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
-    surface = by_surface(patch, hint, cfg, others)
     known = T_cam_obj is not None and target.past.full
     beside = predicted.beside & (surface <= 0) if known else None
-    log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside)
-    stays = cfg.prior_weight * np.where(jumped | predicted.shown, 0, 2 * prior - 1)
+    log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside, free)
+    stays = cfg.prior_weight * np.where(foreign | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
     # Parts that come into view are connected with those that were seen before.
     log_odds += np.where(component, np.maximum(stays, 0), stays)
-    log_odds[jumped] -= cfg.geometry_weight
+    log_odds[foreign] -= cfg.geometry_weight
     log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + surface
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
@@ -120,7 +123,8 @@ def with_room(view: View, target: Target, hint: Hint) -> Target:
     if motions is None or not scene_stays(patch, motions):
         return target
     plane = support_plane(patch, patch.depth_m > 0)
-    _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions)
+    free = free_before(patch, motions)
+    _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions, free=free)
     if not component.any():
         return target
     away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)
