@@ -10,6 +10,7 @@ from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import following
+from p2p_lib.segmenters.builtin import segmenter as stages
 from p2p_lib.segmenters.builtin.cut import by_geometry
 from p2p_lib.segmenters.builtin.motion import Motions, Past, agrees, free_before, parts_that_follow, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, components_touching, connected_components
@@ -215,6 +216,26 @@ def test_where_the_wall_was_seen_through_it_is_not_the_object():
         assert component[plate].all() and component[inner].all() == component[inner].any() == taken
 
 
+@pytest.mark.parametrize(
+    "what, free",
+    [("as it is", True), ("thin", False), ("hardly before it", False), ("not seen then", False), ("not seen", False)],
+)
+def test_what_is_wide_measured_and_far_behind_says_that_it_was_free(what, free):
+    """A block where the wall was seen. Depth that is missing is at the camera, of which a motion makes any place."""
+    then, now = (Frame(k, k / 30, _texture(9), np.full((240, 320), WALL_M, np.float32)) for k in range(2))
+    block, T_then_now = np.zeros((240, 320), bool), np.eye(4)
+    block[110:140, 140 : 144 if what == "thin" else 180] = True
+    now.depth_m[block] = WALL_M - 0.02 if what == "hardly before it" else PLATE_M
+    if what == "not seen then":
+        then.depth_m[block] = 0
+    if what == "not seen":
+        now.depth_m[block], T_then_now[2, 3] = 0, 0.3
+    patch = Patch.of(now, Box(110, 80, 210, 170), CAMERA, CONFIG)
+    found = free_before(patch, Motions(now, (then, T_then_now), ((then, T_then_now),)))
+    inside = patch.down(block.astype(np.float32)) > 0.9
+    assert inside.any() and (found[inside].all() if free else not found.any())
+
+
 @pytest.mark.parametrize("on_surface", [False, True])
 def test_what_comes_to_touch_it_is_not_taken_in_unless_it_is_on_its_surface(on_surface):
     """A block, at the same depth and in its colours."""
@@ -253,18 +274,28 @@ def scene_of_nothing(k: int) -> Frame:
     return Frame(k, k / 30, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32))
 
 
-def test_there_is_room_for_parts_that_reach_farther_than_all_that_was_seen():
-    """The part sticks out of the box that the plate alone asks for."""
+@pytest.mark.parametrize("came", [False, True])
+def test_there_is_room_for_parts_that_reach_farther_than_all_that_was_seen(came, monkeypatch):
+    """The part sticks out of the box that the plate alone asks for; what came since asks for none."""
+    rooms: list[float] = []
+
+    def with_room_noted(*asked):
+        rooms.append(following.with_room(*asked).room_m.max())
+        return following.with_room(*asked)
+
+    monkeypatch.setattr(stages, "with_room", with_room_noted)
     segmenter, tall = BuiltinSegmenter(CAMERA, CONFIG), (125, 20, 30, 90)
     points = np.stack(np.meshgrid(np.linspace(115, 165, 5), np.linspace(115, 145, 4)), -1).reshape(-1, 2)
-    for k in range(36):
+    for k in range(50 if came else 36):
         moved_m = 0.003 * k
         frame, plate, part = scene(k, moved_m), at(PLATE, moved_m), at(tall, moved_m, PART_M)
-        frame.rgb[part & ~plate], frame.depth_m[part & ~plate] = (40, 170, 60), PART_M
+        if k >= 12 or not came:
+            frame.rgb[part & ~plate], frame.depth_m[part & ~plate] = (40, 170, 60), PART_M
         hint = Hint(points - [CAMERA.fx * moved_m / PLATE_M, 0], T_cam_obj=left(moved_m))
         clicks = () if k else [Prompt("it", 0, np.array([[130.0, 125], [150, 130], [140, 140]]))]
         found = segmenter.segment(frame, clicks, {"it": hint} if k else None) == 1
-    assert found[part & ~plate].mean() > 0.8
+    assert (max(rooms[-4:]) > 0.15) != came
+    assert (found[part & ~plate].mean() > 0.8) != came
 
 
 def test_a_look_alike_in_view_is_not_the_absent_object():

@@ -75,7 +75,7 @@ def by_geometry(
     seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Returns the log-odds (h, w) and the
     component (h, w) bool that is connected with the seeds, empty unless it looks like one object. Parts beside it
     that share its ``motions`` are added to it. What touches the seeds, but was seen a frame ago ``beside`` (h, w) bool
-    the object, is not of it.
+    the object, or was ``free`` (h, w) bool before, is not of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
