@@ -156,4 +156,5 @@ def _flow(axis: Axes, at: Mapping[str, tuple[float, float]]) -> None:
     for name in ("refinement", "selection"):
         x = min(at[name][0] + 0.25, fx + 0.1)
         arrow((fx + (x - fx) / 4, my + h), (x, oy - h))
-    axis.text(7.6, -0.56, "dashed: ours beyond the paper", ha="right", fontsize=6.5, color=style.NEUTRAL[0])
+    ours = "dashed: ours beyond the paper, which selects before it refines"
+    axis.text(7.6, -0.56, ours, ha="right", fontsize=6.5, color=style.NEUTRAL[0])

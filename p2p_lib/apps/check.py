@@ -252,7 +252,8 @@ def _size(name: str, known_m: float, frame: Frame, mask: np.ndarray, camera: Cam
         return Finding(f"{name}: size", Level.OPTIONAL, text, "p2p run --size measures it in every frame.")
     of = Lengths(known_m, measured_m := mask_length_m(frame, mask, camera))
     if text := of.doubt:
-        return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", "Mend K or --depth-scale first.")
+        fix = "Look at the mask first; if it holds the object alone, mend K or --depth-scale."
+        return Finding(f"{name}: size", Level.LOOK, f"{text} (frame {frame.index})", fix)
     if not np.isfinite(measured_m):
         text = f"{100 * known_m:g} cm given; its mask in frame {frame.index} has too little depth to be measured"
         return Finding(f"{name}: size", Level.OPTIONAL, text)

@@ -66,7 +66,7 @@ def _check(a: argparse.Namespace) -> int:
     prompts = load_prompts(a.prompts) if a.prompts else ()
     how = {"format": a.format, "depth_scale": a.depth_scale, "sizes": RunOptions.of_arguments(a).sizes}
     findings = check_folder(a.sequence, prompts=prompts, **how)
-    fine = "Nothing is wrong with it as far as can be seen."
+    fine = "Nothing is wrong with it as far as can be seen. Whether masks are objects, first_masks.png of a run shows."
     print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
 

@@ -24,7 +24,7 @@ from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import FORM, Words
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.compiled import warm_up
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.memory import load_memories
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -137,6 +137,7 @@ def track_live(
         stop = math.inf if options.stop is None else options.stop
         newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog, stop))
         frame = first or newest.take()
+        nothing_came = frame is None
         if frame is not None and words is not None and words.reads:
             say(f"{camera.name} runs; objects are told on standard input, a line each: {FORM}")
         while frame is not None:
@@ -154,6 +155,8 @@ def track_live(
             count.until(options.stop)
         for estimates in method.finish():
             tell(estimates)
+    if prompts and nothing_came:
+        raise MissingData(f"camera {camera.name}", "it gave no image", "Is it connected, and not in use elsewhere?")
     if prompts:
         got = f"frame {prompts[0].frame}, which never came"
         raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")

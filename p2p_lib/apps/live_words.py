@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from urllib.parse import urlsplit
 
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, in_a_line
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean, in_a_line
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets.prompts import KEYS, parse_prompts
 from p2p_lib.extended.default import Point2Pose
@@ -74,7 +74,10 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
     elif isinstance(message, dict) and {"name"} < message.keys() <= KEYS:
         prompts = parse_prompts({"objects": [message]})
     else:
-        raise BadInput("line", line.strip()[:60], FORM)
+        known = isinstance(message, dict) and "name" in message
+        odd = sorted(message.keys() - KEYS) if known else []
+        fix = did_you_mean(odd[0], KEYS) if odd else "Say where it is: points, negative or box." if known else ""
+        raise BadInput("line", line.strip()[:60], FORM, fix)
     return [(prompt.name, prompt) for prompt in prompts]
 
 

@@ -226,7 +226,11 @@ def _stale(a: argparse.Namespace) -> int:
         "pictures and their index go here, over those there (default $P2P_FIGURES, else figures/ of the clone)",
         "--figures",
     ),
-    arg("--only", metavar="fig1_three_objects,runtime", help="these pictures alone, by their names"),
+    arg(
+        "--only",
+        metavar="fig1_three_objects,runtime",
+        help="these pictures alone, by their names; the runs are those of all",
+    ),
     arg(
         "--poses",
         type=Path,

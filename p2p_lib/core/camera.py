@@ -11,6 +11,9 @@ import numpy as np
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_image
 
+#: No camera without distortion has a focal length of a smaller share of its image's width: it sees 157 degrees.
+_WIDEST = 0.1
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -49,6 +52,9 @@ class Camera:
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K - pinhole).max() > 1e-6:
             raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
+        if K[0, 0] < _WIDEST * width:
+            fix = "Normalised ones times the width, the height below, are pixels."
+            raise BadInput(name, f"fx = {K[0, 0]:g} for {width} columns", "focal lengths in pixels", fix)
         return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
 
     def resized(self, width: int, height: int) -> Camera:

@@ -73,12 +73,17 @@ class Doubt(UserWarning):
     """What can be meant, and most often is not: tracking goes on."""
 
 
-def doubt(name: str, got: object, fix: str) -> None:
-    """Warn of what came, saying what to do if it was not meant; the line named is the caller's of this library."""
+def doubt(name: str, got: object, fix: str) -> str:
+    """Warn of what came, saying what to do if it was not meant; the line named is the caller's of this library.
+
+    Returns what it says.
+    """
     level, at = 2, sys._getframe(1)
     while at.f_back is not None and at.f_globals.get("__name__", "").startswith(("p2p_lib.", "contextlib")):
         level, at = level + 1, at.f_back
-    warnings.warn(Doubt(_sentence(f"{name}: {got}", fix)), stacklevel=level)
+    said = Doubt(_sentence(f"{name}: {got}", fix))
+    warnings.warn(said, stacklevel=level)
+    return str(said)
 
 
 class Doubts:

@@ -118,7 +118,11 @@ class LazyHints(Mapping[str, Hint]):
 
 
 class Segmenter(Protocol):
-    """A streaming, causal segmenter of several objects."""
+    """A streaming, causal segmenter of several objects.
+
+    It may have ``doubts``, too: of objects that a prompt of the newest frame has started, what is doubtful about their
+    masks. Their first pose is doubted then, and says so.
+    """
 
     name: str
 

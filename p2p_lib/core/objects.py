@@ -20,7 +20,7 @@ from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
 from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
-from p2p_lib.core.types import NOT_FOUND, OUT_OF_VIEW, Frame, PoseEstimate, Status
+from p2p_lib.core.types import DOUBTED, NOT_FOUND, OUT_OF_VIEW, Frame, PoseEstimate, Status
 
 
 class Followed(Protocol):
@@ -41,7 +41,7 @@ class Objects(ABC, Generic[FollowedT]):
     """What a user adds, corrects and removes; whoever tracks them says what it is to ``begin`` one.
 
     One thread at a time calls it, whichever that is: another one that comes meanwhile gets :class:`BadInput`, and
-    nothing has changed.
+    nothing has changed. :meth:`predict` alone may be asked at any time.
 
     objects  what follows each of them, by name
     closed   whether it has been ended
@@ -58,6 +58,7 @@ class Objects(ABC, Generic[FollowedT]):
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
         self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
+        self._unstarted: dict[str, str] = {}  # objects, and why what was selected of them last did not start them
         self._turn, self.closed = RLock(), False
         self._predictor = Predictor()
         self._cameras: deque[tuple[float, np.ndarray | None]] = deque()  # time and T_world_cam of frames, as given
@@ -65,8 +66,7 @@ class Objects(ABC, Generic[FollowedT]):
     @contextmanager
     def alone(self) -> Iterator[None]:
         """While one thread is inside no other one can be; nobody can once it is closed."""
-        if self.closed:
-            raise BadInput("tracker", "a call after close()", "an open tracker", "Make a new one, or reset() this one.")
+        self._check_open()
         if not self._turn.acquire(blocking=False):
             fix = "Put a lock around its calls, or give each thread a tracker of its own."
             raise BadInput("tracker", "a call from a second thread meanwhile", "one thread at a time", fix)
@@ -74,6 +74,10 @@ class Objects(ABC, Generic[FollowedT]):
             yield
         finally:
             self._turn.release()
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise BadInput("tracker", "a call after close()", "an open tracker", "Make a new one, or reset() this one.")
 
     def close(self) -> None:
         """End the threads once their work is done; afterwards nothing can be tracked. Once more does nothing."""
@@ -170,6 +174,7 @@ class Objects(ABC, Generic[FollowedT]):
                 self.begin(name)
             self._prompts[name] = prompt
             self.refused.pop(name, None)
+            self._unstarted.pop(name, None)
 
     def remove_object(self, name: str) -> None:
         """Stop following an object; its points are dropped from the tracker.
@@ -180,7 +185,7 @@ class Objects(ABC, Generic[FollowedT]):
         with self.alone():
             if len(ids := self.objects.pop(name).ids):
                 self.tracker.drop(ids)
-            for kept in (self._prompts, self.refused, self._without):
+            for kept in (self._prompts, self.refused, self._without, self._unstarted):
                 kept.pop(name, None)
             self._predictor.forget(name)
             if name in self.segmenter.names:
@@ -192,12 +197,12 @@ class Objects(ABC, Generic[FollowedT]):
         time_s  not before the newest pose of more confidence than 0.5. The covariance grows with the time since:
                 after a second it says little
 
-        None until there is such a pose. Raises :class:`BadInput` for an unknown name, an earlier time
-        and what is no time.
+        None until there is such a pose. Any thread may ask, also while :meth:`step` is at work: it is told what was
+        known before. Raises :class:`BadInput` for an unknown name, an earlier time and what is no time.
         """
-        with self.alone():
-            self._check_known("predict", name)
-            return self._predictor.predict(name, time_s)
+        self._check_open()
+        self._check_known("predict", name)
+        return self._predictor.predict(name, time_s)
 
     def take_prompts(
         self, frame: Frame, masks: Mapping[str, np.ndarray | None]
@@ -226,22 +231,28 @@ class Objects(ABC, Generic[FollowedT]):
                      None where there was none
 
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
-        is no world of the user's.
+        is no world of the user's. The first pose of an object whose mask is doubtful is doubted.
         """
         name = estimate.object
+        said = getattr(self.segmenter, "doubts", {}).get(name, "")
+        if said:
+            estimate = replace(estimate, confidence=min(estimate.confidence, DOUBTED))
         self._next_map[name] = max(self._next_map.get(name, 0), estimate.map_id + 1)
         T_world_cam = next((T for time_s, T in reversed(self._cameras) if time_s == estimate.time_s), None)
         self._predictor.add(estimate, T_world_cam)
         if estimate.T_cam_obj is not None and T_world_cam is not None:
             estimate = replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
+        if estimate.status is Status.INITIALISING and (said or (mask is not None and mask.any())):
+            self._unstarted[name] = f"not seen yet: {said}" if said else estimate.reason
         reason = self._reason(estimate, frame, mask, given is not None)
-        return replace(estimate, reason="; ".join(part for part in (reason, frame.remark) if part))
+        parts = (reason, said * (estimate.T_cam_obj is not None), frame.remark)
+        return replace(estimate, reason="; ".join(filter(None, parts)))
 
     def _reason(self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, mask_given: bool) -> str:
         """Why an estimate has its status, with what prompts, depth and earlier frames tell of it.
 
-        Of an object that has not started, what was wrong with its prompt. Where nobody gave a mask, an object without
-        pixels may be hidden, or in view and not found; since when, is sure.
+        Of an object that has not started, what was wrong with its prompt, and with what that selected. Where nobody
+        gave a mask, an object without pixels may be hidden, or in view and not found; since when, is sure.
         """
         name = estimate.object
         if estimate.T_cam_obj is not None:
@@ -252,6 +263,8 @@ class Objects(ABC, Generic[FollowedT]):
             return str(self.refused[name])
         if estimate.reason and (trouble := depth_trouble(frame, mask)):
             return trouble
+        if estimate.status is Status.INITIALISING:
+            return self._unstarted.get(name, estimate.reason)
         if estimate.status != Status.OCCLUDED or mask_given:
             return estimate.reason
         known = f"{OUT_OF_VIEW}: " * estimate.reason.startswith(OUT_OF_VIEW)

@@ -26,7 +26,7 @@ _FORGOTTEN_S = 1.0
 class Prediction:
     """An object's pose at a time to come, or at that of its newest sure pose.
 
-    T_cam_obj    (4, 4) in the camera as it stands at the newest frame
+    T_cam_obj    (4, 4) in the camera as it stands at the newest frame, of those with T_world_cam where some have one
     covariance   (6, 6) of the pose, right tangent: [rotation rad, translation m]
     velocity     (6,) in the object frame: [turn rad/s, move m/s]; ``T_cam_obj[:3, :3] @ velocity[3:]`` is the move in
                  the camera frame. Against the world where frames bring T_world_cam, else against the camera
@@ -81,39 +81,47 @@ class Predictor:
     """Keeps the motion of every object up with the estimates."""
 
     def __init__(self) -> None:
-        self._moving: dict[str, Moving] = {}
-        self._T_world_cam: np.ndarray | None = None
+        # Object to its motion and T_world_cam: one value, so that who asks from another thread gets both of one frame.
+        self._known: dict[str, tuple[Moving, np.ndarray | None]] = {}
 
     def add(self, estimate: PoseEstimate, T_world_cam: np.ndarray | None) -> None:
-        """Take in an estimate of the newest frame; T_world_cam (4, 4) as the frame brought it."""
-        self._T_world_cam, name = T_world_cam, estimate.object
-        known = self._moving.get(name)
+        """Take in an estimate of the newest frame; T_world_cam (4, 4) as the frame brought it.
+
+        A frame without one, as where a transform came too late, says nothing of a motion in the world, which goes on.
+        """
+        name = estimate.object
+        known, _ = self._known.get(name, (None, None))
+        if known is not None and known.in_world and T_world_cam is None:
+            if estimate.time_s - known.time_s <= _FORGOTTEN_S:
+                return
         if estimate.T_cam_obj is None or estimate.confidence <= DOUBTED:
+            if known is not None:
+                self._known[name] = known, T_world_cam
             return
         in_world = T_world_cam is not None
         T = estimate.T_cam_obj if T_world_cam is None else T_world_cam @ estimate.T_cam_obj
         noise = np.diag(np.repeat(_POSE, 3) ** 2) if estimate.covariance is None else estimate.covariance
         same = known is not None and (known.map_id, known.in_world) == (estimate.map_id, in_world)
         if known is None or not same or not 0 < estimate.time_s - known.time_s <= _FORGOTTEN_S:
-            self._moving[name] = Moving.begun(T, noise, estimate.time_s, estimate.map_id, in_world)
+            moving = Moving.begun(T, noise, estimate.time_s, estimate.map_id, in_world)
         else:
-            self._moving[name] = known.at(estimate.time_s).with_pose(T, noise)
+            moving = known.at(estimate.time_s).with_pose(T, noise)
+        self._known[name] = moving, T_world_cam
 
     def forget(self, name: str) -> None:
         """The object is gone."""
-        self._moving.pop(name, None)
+        self._known.pop(name, None)
 
     def predict(self, name: str, time_s: float) -> Prediction | None:
         """The pose at a time, at or after that of the newest sure pose; None where there never was one."""
         if isinstance(time_s, bool) or not isinstance(time_s, Real):
             raise BadInput("predict time_s", repr(time_s), "a time in seconds")
-        known = self._moving.get(name)
-        if known is None or (known.in_world and self._T_world_cam is None):
+        known, T_world_cam = self._known.get(name, (None, None))
+        if known is None or (known.in_world and T_world_cam is None):
             return None
         if not known.time_s <= time_s < np.inf:
             raise BadInput("predict time_s", time_s, f"a time from that of the newest sure pose on, {known.time_s:g} s")
         then = known.at(time_s)
-        T_world_cam = self._T_world_cam if known.in_world else None
-        T_cam_obj = then.T if T_world_cam is None else se3.inverse(T_world_cam) @ then.T
+        T_cam_obj = se3.inverse(T_world_cam) @ then.T if known.in_world and T_world_cam is not None else then.T
         rest = then.covariance[:6, :6], then.velocity, then.T if known.in_world else None
         return Prediction(name, time_s, T_cam_obj, *rest)

@@ -212,6 +212,7 @@ class PoseEstimate:
     covariance      (6, 6) or None: right tangent of T_cam_obj, [rotation rad, translation m]
     confidence      in [0, 1]; 0 without a pose
     reason          why the status is what it is, in words; empty when tracked, unless something is wrong with the frame
+                    or the pose is doubted for a reason that can be told
     visible_points  the object's points that the 2D tracker saw; those that this very frame adds are not among them
     inliers         keypoints that agree on the pose; in the frame in which a map begins, those it begins with
     keyframe        whether the frame was taken into the map

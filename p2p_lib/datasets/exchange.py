@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, doubt
 from p2p_lib.core.files import check_new, read_text, replace_text
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
@@ -34,6 +34,8 @@ from p2p_lib.datasets.sequence import Sequence
 FORMATS = ("tum", "poses", "bop")
 BOP_HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 MATRIX_FOLDERS = ("ob_in_cam", "annotated_poses")
+#: Poses so many times as far apart as frames may have been given the times of another rate.
+_SLOWER = 1.5
 
 
 def export(
@@ -206,6 +208,9 @@ def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
     if far.any():
         want = f"times of the sequence's frames, {times_s[0]:.6f} to {times_s[-1]:.6f} s"
         raise BadInput(str(path), f"the time {given_s[np.argmax(far)]:.6f} s", want)
+    if len(rows) > 2 and (slower := np.median(np.diff(given_s)) / np.median(np.diff(times_s))) > _SLOWER:
+        got = f"poses {slower:.1f} times as far apart in time as the frames are"
+        doubt(str(path), got, "Frames without a pose count as lost: is the rate right that the times were made with?")
     poses[nearest] = se3.from_rt(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4])
     return poses
 

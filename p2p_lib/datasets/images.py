@@ -25,7 +25,7 @@ DEPTH_SCALE = 0.001  # metres per raw unit: all layouts here store millimetres
 DEFAULT_HZ = 30.0
 _UNDECODED: tuple[type[Exception], ...] = (*UNREADABLE, cv2.error)
 #: What to do about a frame that cannot be read, where nobody can mend it.
-SKIP_BAD = "p2p run --skip-bad goes on without such frames."
+SKIP_BAD = "p2p run --skip-bad goes on without such frames (with --resume where a run was begun)."
 #: Numbers of two images that belong together go on alike, to this share of a step.
 _OUT_OF_STEP = 0.75
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.

@@ -6,6 +6,7 @@ import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -89,6 +90,7 @@ class RunWriter:
             "sequence": sequence.name,
             "path": None if synthetic or sequence.path is None else str(sequence.path),
             "format": sequence.format,
+            "camera": asdict(sequence.camera),
             "objects": list(self._estimates),
             "start": start,
             "stop": len(sequence) if stop is None else min(stop, len(sequence)),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, doubt
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.plugins import find, offered
 from p2p_lib.core.types import Frame
@@ -186,14 +186,23 @@ def _scene(name: str, seed: int | None) -> tuple[str, int]:
 
 
 def reopen(info: Mapping[str, Any]) -> Sequence:
-    """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`."""
+    """The sequence that a run was made on, as its ``run.json`` says; raises as :func:`open_sequence`.
+
+    Warns where its camera is another one since: poses and meshes are of the camera that the run was made with.
+    """
     if info["format"] == LIVE:
         fix = "To have them afterwards, record them as a folder and give that to p2p run."
         raise MissingData(f"images of {info['sequence']}", "it was a live camera's, of which none are kept", fix)
     asked = info.get("options") or {}
     depth_scale, gaps = asked.get("depth_scale"), bool(asked.get("skip_bad"))
     seed = info["seed"] if info.get("scene_seed") is None else info["scene_seed"]  # of older runs both are the same
-    return open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, seed, gaps=gaps)
+    found = open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, seed, gaps=gaps)
+    was, now = (info.get("camera"), asdict(found.camera))
+    if was is not None and was != now:
+        k = next((key for key in now if was.get(key) != now[key]), "fx")
+        fix = "Its poses and meshes are of the camera that it had: run it again, or give it that camera back."
+        doubt(f"camera of {found.name}", f"{k} = {now[k]:g}, and {was.get(k)} when the run was made", fix)
+    return found
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:

@@ -17,10 +17,13 @@ from p2p_lib.datasets.mask_log import load_masks
 #: What is longer than known by more than this factor and this slack, m, is not the object as it is, nor what is always
 #: so much shorter: a part of it may be hidden, or seen end-on. Surfaces of well tracked objects are 1 cm too long.
 LONGER, SLACK_M, SHORTER = 1.15, 0.01, 0.7
+#: A mask is as long as what it shows from corner to corner: of a cube's side by up to this factor longer.
+_ACROSS = 2**0.5
 #: Points of a surface that are measured, and the share of them at either end that is not: shreds at its rim.
 _POINTS, _SHREDS = 4000, 0.01
 #: By such a factor everything is longer than known where the length was given in metres for centimetres.
 _IN_METRES = 80, 125
+_MASKS = "in its masks"
 #: A mask shows the whole object at least so often.
 _OFTEN = 0.9
 
@@ -40,33 +43,36 @@ class Lengths:
     @property
     def doubt(self) -> str:
         """What speaks against the known length, in words; "" where nothing does."""
-        least_m, most_m = self._range_m
-        off = [m / self.known_m for m in self._measured.values() if not least_m <= m <= most_m]
+        off = [m / self.known_m for what, m in self._measured.items() if not self._fits(what, m)]
         if not off or (len(off) < len(self._measured) and min(off) < 1):  # the other has seen all of it
             return ""
         factor = float(np.median(off))
         text = f"known to be {100 * self.known_m:g} cm long, measured {self._found}, {factor:.2f} times"
         if _IN_METRES[0] < factor < _IN_METRES[1]:
             return f"{text}: sizes are in centimetres, {100 * self.known_m:g} may be metres"
-        besides = "its length was never in view" if factor < 1 else "masks hold more than the object"
-        return f"{text}: focal length or depth scale is wrong by this factor, or {besides}"
+        mask = "its length was never in view" if factor < 1 else "masks hold more than the object"
+        return f"{text}: {mask}, or focal length or depth scale is wrong by about this factor"
 
     @property
     def fit(self) -> str:
         """That it is measured as long as it is known to be, in words; "" where it is not, or not measured."""
         if self.doubt or not self._measured:
             return ""
-        least_m, most_m = self._range_m
+        least_m, most_m = self._range_m(list(self._measured)[-1])
         given = f"{100 * self.known_m:g} cm given"
         return f"measured {self._found}, {given}: fits, as {100 * least_m:.0f} to {100 * most_m:.0f} cm would"
 
-    @property
-    def _range_m(self) -> tuple[float, float]:
-        return SHORTER * self.known_m, LONGER * self.known_m + SLACK_M
+    def _range_m(self, what: str) -> tuple[float, float]:
+        across = _ACROSS if what == _MASKS else 1.0
+        return SHORTER * self.known_m, LONGER * across * self.known_m + SLACK_M
+
+    def _fits(self, what: str, m: float) -> bool:
+        least_m, most_m = self._range_m(what)
+        return least_m <= m <= most_m
 
     @property
     def _measured(self) -> dict[str, float]:
-        each = {"in its masks": self.mask_m, "of its surface": self.mesh_m}
+        each = {_MASKS: self.mask_m, "of its surface": self.mesh_m}
         return {what: m for what, m in each.items() if np.isfinite(m)}
 
     @property

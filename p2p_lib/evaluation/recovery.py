@@ -55,4 +55,4 @@ def returns_of(events: Iterable[RecoveryEvent]) -> str:
     """The returns of an object for people."""
     delays = [event.frames_to_recovery for event in events]
     after = ", ".join("never" if delay is None else str(delay) for delay in delays)
-    return f"returns after an absence: {len(delays)}; frames until it was found again: {after}"
+    return f"returns after an absence: {len(delays)}; frames until it was found again (ADD-S of 2 cm at most): {after}"

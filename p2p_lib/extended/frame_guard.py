@@ -16,6 +16,8 @@ from p2p_lib.extended.depth_lag import DepthLag
 _STANDS_S = 0.08
 #: So long between frames, s, so many times in a row, is a time in another unit.
 _SLOW_S, _SLOW_FRAMES = 10.0, 3
+#: What to divide times by that are so long apart at least, s, at the rates of cameras.
+_UNITS = {"nanoseconds by 1e9": 1e6, "microseconds by 1e6": 1e3, "milliseconds by 1000": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,8 @@ class FrameGuard:
         self._slow = self._slow + 1 if _SLOW_S < frame.time_s - before_s < np.inf else 0
         if self._slow == _SLOW_FRAMES:
             got = f"{frame.time_s - before_s:.0f} s after the frame before, for the third time in a row"
-            doubt(f"time of frame {frame.index}", got, "Times are in seconds: divide milliseconds by 1000.")
+            unit = next(unit for unit, least_s in _UNITS.items() if frame.time_s - before_s >= least_s)
+            doubt(f"time of frame {frame.index}", got, f"Times are in seconds: divide {unit}.")
         if frame.time_s > before_s or (stopped and self._stopped):
             return ""
         got = f"{frame.time_s:.6f} s, not later than the frame before ({before_s:.6f} s)"

@@ -100,7 +100,7 @@ def test_a_score_says_where_masks_came_from_and_how_soon_objects_were_back(masks
     obj = standing(visible, found)
     scored = evaluate(Run(None, {"masks": masks, "segmenter": "builtin"}, {"mug": obj}, {"mug": POINTS}, {}))
     table = scored.as_table()
-    assert "mug: returns after an absence: 3; frames until it was found again: 0, 7, never" in table
+    assert "returns after an absence: 3; frames until it was found again (ADD-S of 2 cm at most): 0, 7, never" in table
     assert f"masks {masks}, segmenter builtin" in table and ("masks that were given tell" in table) == told
     assert scored.as_dict()["objects"]["mug"]["frames_to_recovery"] == [0, 7, None]
     assert scored.as_dict()["masks"] == masks

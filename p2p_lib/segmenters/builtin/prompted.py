@@ -55,6 +55,8 @@ _NOT_IT = 3.0
 _TOLERANCE_PX = 3.0
 #: Cuts in the wide box and in the tight one; weight, in the background's colours, of a cell at a click beside it.
 _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
+#: A box may be filled by a mask's own box up to this intersection over union without doubt, which then grows so fast.
+_FILLED, _PER_UNFILLED = 0.7, 2.0
 #: Clicks may be close together on something large, or at the ends of something thin: the scales tried, as the object's
 #: extent over theirs. A cut's doubt is divided by the scale's value: the print inside an object has edges, too.
 _SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
@@ -68,8 +70,8 @@ _AROUND_PX = 3
 class Cut:
     """An object cut out in a box, its probability x (rows, columns).
 
-    doubtful  mean tie across its outline, low along edges, plus the share of clicks on something else that it holds;
-              larger for scales other than 1
+    doubtful  mean tie across its outline, low along edges, plus the share of clicks on something else that it holds,
+              plus what it leaves of a box that was drawn around it; larger for scales other than 1
     """
 
     doubtful: float
@@ -136,12 +138,16 @@ class Cutter:
         """
         cfg = self.config
         clicked = Clicked.of(patch, clicks_px, z_m, scale).hidden_by(patch.down(hides) > 0.5)
-        height = Height.of(patch, clicked)
+        near = by_distance(patch, z_m, cfg)
+        height = Height.of(patch, clicked, near >= 0)
         looks = unlike(patch, height.plane)
-        connected = by_connection(patch, clicked, height, looks) + self._nearer_to_others(patch, clicked)
+        connected = by_connection(patch, clicked, height, looks, self.prompt.box_px is not None)
+        connected += self._nearer_to_others(patch, clicked)
         clicked = clicked.within(looks) if height.flat else clicked
-        prior = clicked.prior_beside(connected)
-        x = self._cut_out(patch, clicked, prior, by_distance(patch, z_m, cfg) + height.log_odds + connected)
+        prior, geometry = clicked.prior_beside(connected), near + height.log_odds + connected
+        # What depth keeps apart from the clicks lends the object no colour, however near it is, but the background.
+        own, other = clicked.near * (connected >= 0), np.maximum(clicked.beyond, connected < 0)
+        x = self._cut_out(patch, clicked, prior + self._tolerated(patch, geometry), own, other)
         whole, there, other = np.zeros((3, *self.frame.shape), np.float32)
         for image, values in ((whole, x), (there, connected), (other, looks)):
             image[patch.box.slices] = patch.up(values)
@@ -152,10 +158,25 @@ class Cutter:
         height = height.on(patch, clicked)
         clicked = clicked.within(patch.down(other) > 0.5) if height.flat else clicked
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
-        x = self._cut_out(patch, clicked, clicked.prior_beside(connected) / 2, geometry, patch.down(whole))
+        fixed, was = clicked.prior_beside(connected) / 2 + self._tolerated(patch, geometry), patch.down(whole)
+        x = self._cut_out(patch, clicked, fixed, was, 1 - was, was)
         mask, others = x > 0.5, patch.dots(self._others_px, _AROUND_PX)
         inside = mask[others].mean() if others.any() else 0.0
-        return Cut(float(patch.outline_tie(mask) + inside) / _SCALES[scale], patch.box, patch.up(x))
+        doubtful = patch.outline_tie(mask) + inside + self._unfilled(patch, mask)
+        return Cut(float(doubtful) / _SCALES[scale], patch.box, patch.up(x))
+
+    def _tolerated(self, patch: Patch, geometry: np.ndarray) -> np.ndarray:
+        """Log-odds (h, w) of geometry as far as they hold where depth ends beside the outline that colour shows."""
+        return tolerant(filled(geometry, patch.depth_m > 0), _TOLERANCE_PX / patch.cell_px)
+
+    def _unfilled(self, patch: Patch, mask: np.ndarray) -> float:
+        """The doubt of a mask (h, w) bool that fills too little of the box that was drawn around it."""
+        if self.prompt.box_px is None or not mask.any():
+            return 0.0
+        (low, high), (first, last) = patch.ends_px(mask), self.prompt.box_px.reshape(2, 2)
+        both = np.prod(np.maximum(np.minimum(high, last) - np.maximum(low, first), 0))
+        either = np.prod(high - low) + np.prod(last - first) - both
+        return float(_PER_UNFILLED * max(_FILLED - both / either, 0))
 
     def correct(self, was: np.ndarray) -> tuple[Box, np.ndarray]:
         """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays.
@@ -204,25 +225,32 @@ class Cutter:
         clicks = self.prompt.points_px
         z_m = float(np.nanmedian(depths_at(clicks, self.frame)))
         clicked = Clicked.of(patch, clicks, z_m)
-        height = Height.of(patch, clicked)
-        connected = by_connection(patch, clicked, height, unlike(patch, height.plane))
-        return by_distance(patch, z_m, self.config) + height.log_odds + connected
+        near = by_distance(patch, z_m, self.config)
+        height = Height.of(patch, clicked, near >= 0)
+        return near + height.log_odds + by_connection(patch, clicked, height, unlike(patch, height.plane))
 
     def _cut_out(
-        self, patch: Patch, clicked: Clicked, prior: np.ndarray, geometry: np.ndarray, x: np.ndarray | None = None
+        self,
+        patch: Patch,
+        clicked: Clicked,
+        fixed: np.ndarray,
+        own: np.ndarray,
+        other: np.ndarray,
+        x: np.ndarray | None = None,
     ) -> np.ndarray:
         """(h, w) probability of what is connected with the clicks, which count as certain.
 
-        Each cut gives the next one the colours of object and background; the first takes them from around the clicks
-        and from farther away, or from ``x`` (h, w), a cut on another patch.
+        fixed       (h, w) log-odds of all but colour
+        own, other  (h, w) weights by which the first cut takes the colours of object and background: from around the
+                    clicks and from farther away, or by ``x``. Each cut gives the next one its own
+        x           (h, w) a cut on another patch, from which it goes on
         """
         seeds, cfg = clicked.seeds, self.config
         others = patch.dots(self._others_px, 1) & ~seeds
-        fixed = prior + tolerant(filled(geometry, patch.depth_m > 0), _TOLERANCE_PX / patch.cell_px)
         barred = others | patch.border()
         if self.prompt.box_px is not None:
             barred |= ~_within(patch, self.prompt.box_px)
-        own, other = (clicked.near, clicked.beyond + _OTHERS * others) if x is None else (x, 1 - x)
+        other = other + _OTHERS * others if x is None else other
         for _ in range(_ROUNDS if x is None else _ROUNDS_MORE):
             log_odds = fixed + by_shares(patch, own, other, cfg)
             x = cut(patch, log_odds, start=x, seeds=seeds, background=barred & ~seeds, sharp=True)

@@ -61,6 +61,7 @@ class BuiltinSegmenter:
     """The segmenter without learned weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
     refiner  may replace an object's mask in a frame, before it is labelled and learnt from
+    doubts   of objects that a prompt of the newest frame has started: what is doubtful about their masks
     """
 
     def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
@@ -69,6 +70,7 @@ class BuiltinSegmenter:
         self._targets: dict[str, Target] = {}
         self._previous: Frame | None = None
         self._frames = 0
+        self.doubts: dict[str, str] = {}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -110,7 +112,7 @@ class BuiltinSegmenter:
         claims |= self._refined(frame, prompt_of, claims, hints, corrected)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
-        self._doubt_prompts(labels, cutters, new)
+        self.doubts = self._doubts(labels, cutters, new)
         self._previous = frame
         return labels
 
@@ -266,12 +268,14 @@ class BuiltinSegmenter:
             self._targets[name] = target.with_seen(frame, seen, view.focal_px, cfg)
         return labels
 
-    def _doubt_prompts(self, labels: np.ndarray, cutters: Mapping[str, Cutter], new: Collection[str]) -> None:
+    def _doubts(self, labels: np.ndarray, cutters: Mapping[str, Cutter], new: Collection[str]) -> dict[str, str]:
         """Warn if a prompt has selected nothing, or if one that started a ``new`` object may be of something else."""
         masks = {name: labels == label for label, name in enumerate(self._targets, 1)}
+        said = {}
         for name, cutter in cutters.items():
             others = {other: mask for other, mask in masks.items() if other != name}
-            doubt_prompt(cutter, masks[name], others, name in new)
+            said[name] = doubt_prompt(cutter, masks[name], others, name in new)
+        return {name: said[name] for name in new if said[name]}
 
 
 def _cutter(view: View, prompt: Prompt, prompt_of: Mapping[str, Prompt]) -> Cutter:

@@ -25,8 +25,10 @@ _FEW = 10
 _AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
 
 
-def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], starts: bool) -> None:
+def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], starts: bool) -> str:
     """Warn if a prompt has selected nothing, or one that started an object may have selected something else.
+
+    Returns the warning; empty where nothing is doubtful.
 
     cutter  the one that cut it out, with a mask (H, W) bool
     others  the other objects' masks (H, W) bool in this frame
@@ -35,7 +37,7 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
     if not mask.any():
         return doubt_nothing(cutter)
     if not starts:
-        return None
+        return ""
     frame, who = cutter.frame, _who(cutter)
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
@@ -47,22 +49,22 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
         return doubt(who, got, fix)
     if one_body := _one_body(cutter, patch, inside, others):
         fix = "If they are one object, leave one out; else give each a negative click on the other."
-        for other in one_body:
-            doubt(who, f"the prompt selects most of {other!r}, too", fix)
-    elif (astray := _astray(cutter)) is not None:
+        return " ".join([doubt(who, f"the prompt selects most of {other!r}, too", fix) for other in one_body])
+    if (astray := _astray(cutter)) is not None:
         got = f"alone, the click at ({astray[0]}, {astray[1]}) selects something else than the others do"
-        doubt(who, got, "If it is not on the object, leave it out, or make it a negative click.")
-    elif (another := _as_good(cutter, mask, others)) is not None:
+        return doubt(who, got, "If it is not on the object, leave it out, or make it a negative click.")
+    if (another := _as_good(cutter, mask, others)) is not None:
         pixels, (u, v) = another
         got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
-        doubt(who, got, f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it.")
-    return None
+        fix = f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it."
+        return doubt(who, got, fix)
+    return ""
 
 
-def doubt_nothing(cutter: Cutter, instead: str = "") -> None:
+def doubt_nothing(cutter: Cutter, instead: str = "") -> str:
     """Warn that a prompt has selected nothing; ``instead`` says what its object has for a mask."""
     fix = "Click near its centre and on parts of other colours, or draw a box."
-    doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip())
+    return doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip())
 
 
 def _who(cutter: Cutter) -> str:

@@ -149,10 +149,15 @@ class Height:
     log_odds: np.ndarray
 
     @classmethod
-    def of(cls, patch: Patch, clicked: Clicked) -> Height:
-        """By the plane that holds most of what surrounds the clicks."""
+    def of(cls, patch: Patch, clicked: Clicked, near: np.ndarray) -> Height:
+        """By the plane that holds most of what surrounds the clicks, or else of what is ``near`` (h, w) bool, too.
+
+        To a camera beside a table most of what surrounds an object is far behind it.
+        """
         weight = np.exp(-((clicked.extents / 2) ** 2) / 2) + 0.05
-        plane = support_plane(patch, (patch.depth_m > 0) & (clicked.extents > 0.5), weight)
+        around = (patch.depth_m > 0) & (clicked.extents > 0.5)
+        plane = support_plane(patch, around, weight)
+        plane = support_plane(patch, around & near, weight) if plane is None else plane
         return cls(plane, True, np.zeros(patch.shape, np.float32)).on(patch, clicked)
 
     def on(self, patch: Patch, clicked: Clicked) -> Height:
@@ -178,10 +183,13 @@ def by_distance(patch: Patch, z_m: float, config: SegmentationConfig) -> np.ndar
     return np.where(far, -config.geometry_weight, 0).astype(np.float32)
 
 
-def by_connection(patch: Patch, clicked: Clicked, height: Height, looks: np.ndarray) -> np.ndarray:
+def by_connection(
+    patch: Patch, clicked: Clicked, height: Height, looks: np.ndarray, through_holes: bool = False
+) -> np.ndarray:
     """Evidence for what depth connects with the clicks and is not their support, if it ends within the patch.
 
     What is not the support stands above it or, as the handle of a fork on a table, ``looks`` (h, w) bool unlike it.
+    It may go on ``through_holes`` of depth, as from a mug's rim to its inside, and from one thing to the next.
     """
     log_odds, measured = np.zeros(patch.shape, np.float32), patch.depth_m > 0
     above = np.zeros(patch.shape, bool) if height.flat else height.log_odds >= 0
@@ -191,8 +199,8 @@ def by_connection(patch: Patch, clicked: Clicked, height: Height, looks: np.ndar
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = _CONNECTED
     if height.plane is not None:
-        other = (above & measured) | looks
-        component = components_touching(connected_components(other & (patch.smooth | ~measured)), clicked.seeds)
+        linked = ((above & measured) | looks) & (patch.smooth | (through_holes & ~measured))
+        component = components_touching(connected_components(linked), clicked.seeds)
         if component[patch.border()].mean() <= _AT_THE_BORDER:
             log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds

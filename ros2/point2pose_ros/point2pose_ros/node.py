@@ -19,7 +19,7 @@ from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput, MissingBackend, P2PError
 from p2p_lib.core.memory import load_memories, load_memory
 from p2p_lib.core.options import RunOptions, pairs
-from p2p_lib.core.types import PoseEstimate
+from p2p_lib.core.types import DOUBTED, PoseEstimate
 from p2p_lib.datasets.prompts import load_prompts
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import recall
@@ -35,6 +35,7 @@ PARAMETERS: dict[str, Any] = {
     "tracker": DEFAULT_TRACKER,
     "segmenter": DEFAULT_SEGMENTER,
     "frame_prefix": "",
+    "min_confidence": DOUBTED,
     "mesh_period_s": 2.0,
     "slop_s": 0.02,
 }
@@ -165,7 +166,7 @@ def _spin() -> None:
     node = rclpy.create_node("point2pose")
     try:
         given = {name: node.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
-        publish = Publisher(node, given["frame_prefix"])
+        publish = Publisher(node, given["frame_prefix"], given["min_confidence"])
         tracking = TrackingNode(options_of(given), publish.estimate)
         warm_up(node.get_logger().info)
         (services, sensors) = _ros("point2pose_msgs.srv", "sensor_msgs.msg")
@@ -189,10 +190,14 @@ def _spin() -> None:
 
 
 class Publisher:
-    """The topics of a node: ``~/estimates``, ``~/poses/OBJECT``, ``~/meshes``, and the transforms of tf."""
+    """The topics of a node: ``~/estimates``, ``~/poses/OBJECT``, ``~/meshes``, and the transforms of tf.
 
-    def __init__(self, node: Any, prefix: str = ""):
-        self._node, self._prefix = node, prefix
+    prefix          before the names of objects as frames of tf
+    min_confidence  topics that say no confidence get poses of more than this
+    """
+
+    def __init__(self, node: Any, prefix: str = "", min_confidence: float = DOUBTED):
+        self._node, self._prefix, self._min_confidence = node, prefix, min_confidence
         tf2, qos, ours = _ros("tf2_ros", "rclpy.qos", "point2pose_msgs.msg")
         self._geometry, self._markers = _ros("geometry_msgs.msg", "visualization_msgs.msg")
         self._transforms, self._estimate = tf2.TransformBroadcaster(node), ours.ObjectEstimate
@@ -203,9 +208,9 @@ class Publisher:
         self._shown: set[str] = set()
 
     def estimate(self, estimate: PoseEstimate, header: Any) -> None:
-        """What is known of an object; its pose and transform where there is one."""
+        """What is known of an object; its pose and transform where there is one that is not doubted."""
         self._estimates.publish(messages.fill_estimate(self._estimate(), estimate, header))
-        if estimate.T_cam_obj is None:
+        if estimate.T_cam_obj is None or estimate.confidence <= self._min_confidence:
             return
         kind, name = self._geometry.PoseWithCovarianceStamped, estimate.object
         if name not in self._poses:
