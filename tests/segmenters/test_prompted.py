@@ -253,6 +253,37 @@ def test_a_box_starts_an_object_whose_middle_has_no_depth(clicks):
     assert iou(found, LEFT) > 0.8
 
 
+@pytest.mark.parametrize(("shown", "chosen"), [(1.0, 2.5), (0.9, 2.5), (0.4, 1.0)])
+def test_a_cut_that_leaves_much_of_a_box_is_doubted(monkeypatch, shown, chosen):
+    """Of two cuts, the better outline but for what a box asks for."""
+    ties, cut_out = iter((9.0, 0.45, 0.2)), Cutter._cut_out
+    monkeypatch.setattr(Patch, "outline_tie", lambda patch, mask: next(ties))
+
+    def cut(self, patch, *more):
+        x, (v, _) = np.zeros_like(cut_out(self, patch, *more)), patch.centres_px()[::-1]
+        u, v = patch.centres_px()
+        part = shown if len(more) > 4 and next(made) == 2 else 1.0
+        x[np.ix_((v >= 80) & (v < 140), (u >= 90) & (u < 90 + 60 * part))] = 1
+        return x
+
+    made = iter(range(3))
+    monkeypatch.setattr(Cutter, "_cut_out", cut)
+    frame, prompt = picture(), Prompt("left", box_px=(90, 80, 150, 140))
+    best = Cutter(frame, CAMERA, preset().segmentation, prompt, np.zeros((0, 2))).cuts[0]
+    assert (best.whole(frame.shape).sum() > 0.95 * LEFT.sum()) == (chosen == 1.0 or shown > 0.95)
+
+
+def test_what_depth_keeps_apart_lends_no_colour():
+    """One half of a block has the colours of the large one behind it, which a click on that half is near."""
+    rng = np.random.default_rng(0)
+    rgb, depth = np.full((240, 320, 3), 120.0), np.full((240, 320), 1.0)
+    rgb[60:170, 150:250], depth[60:170, 150:250] = (200, 110, 60), 0.9
+    rgb[110:170, 100:150], rgb[110:170, 150:160], depth[110:170, 100:160] = (60, 90, 200), (200, 110, 60), 0.7
+    frame = Frame(0, 0.0, np.clip(rgb + rng.normal(0, 6, rgb.shape), 0, 255).astype(np.uint8), depth.astype(np.float32))
+    found = segmenter().segment(frame, [Prompt("block", points_px=[[157, 140], [150, 120], [110, 160]])]) == 1
+    assert iou(found, rectangle(100, 110, 160, 170)) > 0.9
+
+
 def test_a_box_that_reaches_beyond_the_image_is_cut_to_it():
     frame = picture(moved=-100)
     found = segmenter().segment(frame, [Prompt("left", box_px=(-40, 75, 52, 145))]) == 1

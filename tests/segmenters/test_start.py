@@ -21,6 +21,7 @@ from p2p_lib.segmenters.builtin.patch import Box, Patch, plane_heights, support_
 from p2p_lib.segmenters.builtin.start_evidence import Clicked, Height, by_connection, filled, tolerant, unlike
 
 H, W = 60, 80
+EVERYWHERE = np.ones((H, W), bool)
 CAMERA = Camera(300.0, 300.0, (W - 1) / 2, (H - 1) / 2, W, H)
 
 
@@ -100,10 +101,37 @@ def block(height_m: float) -> tuple[Patch, Clicked]:
 
 def test_height_tells_what_stands_on_a_plane_from_the_plane():
     patch, clicked = block(0.05)
-    height = Height.of(patch, clicked)
+    height = Height.of(patch, clicked, EVERYWHERE)
     assert not height.flat and (height.log_odds[22:38, 32:48] > 0).all() and (height.log_odds[:18] < -1).all()
     connected = by_connection(patch, clicked, height, unlike(patch, height.plane))
     assert (connected[22:38, 32:48] > 0).all() and (connected[:18] < 0).all()
+
+
+def test_beside_a_low_camera_the_table_is_found_before_all_that_is_far_behind():
+    """A block on a table that fills an eighth of what is measured; behind it there is no plane."""
+    v, u = np.mgrid[:H, :W].astype(float)
+    slope = (v - CAMERA.cy) / CAMERA.fy
+    depth = 1.5 + 0.5 * np.sin(u * v / 7)
+    table = v >= 53
+    depth[table] = 0.042 / slope[table]  # 4.2 cm below the camera
+    depth[30:56, 30:50] = 0.042 / slope[56, 0]
+    patch = patch_of(depth.astype(np.float32))
+    clicked = Clicked.of(patch, np.array([[33.0, 34], [46, 36], [38, 44]]), float(depth[40, 40]))
+    near = np.abs(depth - depth[40, 40]) < 0.3
+    assert Height.of(patch, clicked, EVERYWHERE).flat, "else nothing is shown"
+    height = Height.of(patch, clicked, near)
+    assert height.plane is not None and abs(height.plane[1]) > 0.98 and not height.flat
+    assert (height.log_odds[32:44, 32:48] > 0).all() and (height.log_odds[57:, :25] < 0).mean() > 0.9
+
+
+def test_what_lies_beyond_a_hole_of_depth_is_another_thing_but_within_a_box():
+    patch, clicked = block(0.05)
+    depth = patch.depth_m.copy()
+    depth[20:40, 54:70], depth[20:40, 50:54] = 0.93, 0
+    patch = patch_of(depth)
+    height = Height.of(patch, clicked, EVERYWHERE)
+    beside = [by_connection(patch, clicked, height, unlike(patch, height.plane), holes) for holes in (False, True)]
+    assert (beside[0][22:38, 56:68] < 0).all() and (beside[1][22:38, 56:68] > 0).all()
 
 
 def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
@@ -115,7 +143,7 @@ def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
     patch = patch_of(np.ones((H, W), np.float32))
     patch = replace(patch, rgb=np.clip(rgb + rng.normal(0, 2, rgb.shape), 0, 255).astype(np.uint8))
     clicked = Clicked.of(patch, np.array([[22.0, 28], [24, 30], [22, 31]]), 1.0)
-    height = Height.of(patch, clicked)
+    height = Height.of(patch, clicked, EVERYWHERE)
     connected = by_connection(patch, clicked, height, unlike(patch, height.plane))
     assert (connected[29:31, 21:58] > 0).all()
     assert not (connected[:24] > 0).any() and not (connected[38:] > 0).any() and (connected[35] > 0).mean() < 0.1
@@ -124,7 +152,7 @@ def test_what_lies_on_a_table_and_looks_unlike_it_is_one_thing():
 @pytest.mark.parametrize("height_m", [0.0, 0.002])
 def test_what_is_flat_is_not_told_by_height(height_m):
     patch, clicked = block(height_m)
-    height = Height.of(patch, clicked)
+    height = Height.of(patch, clicked, EVERYWHERE)
     assert (
         height.flat
         and not height.log_odds.any()

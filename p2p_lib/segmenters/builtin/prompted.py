@@ -137,7 +137,9 @@ class Cutter:
         hides  (H, W) what is known to be before it
         """
         cfg = self.config
-        clicked = Clicked.of(patch, clicks_px, z_m, scale).hidden_by(patch.down(hides) > 0.5)
+        clicked = Clicked.of(patch, clicks_px, z_m, scale, self.prompt.box_px is None).hidden_by(
+            patch.down(hides) > 0.5
+        )
         near = by_distance(patch, z_m, cfg)
         height = Height.of(patch, clicked, near >= 0)
         looks = unlike(patch, height.plane)
@@ -154,7 +156,9 @@ class Cutter:
         fits = self._room(*patch.ends_px(x > 0.5))
         patch = Patch.of(self.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
         connected = patch.down(there)
-        clicked = Clicked.of(patch, clicks_px, z_m, scale).hidden_by(patch.down(hides) > 0.5)
+        clicked = Clicked.of(patch, clicks_px, z_m, scale, self.prompt.box_px is None).hidden_by(
+            patch.down(hides) > 0.5
+        )
         height = height.on(patch, clicked)
         clicked = clicked.within(patch.down(other) > 0.5) if height.flat else clicked
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected

@@ -67,9 +67,16 @@ class Clicked:
     hides: np.ndarray
 
     @classmethod
-    def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float, scale: float = 1.0) -> Clicked:
-        """Of clicks (N, 2) in the image at a depth, on something ``scale`` times as far across as they are."""
-        seeds = patch.dots(clicks_px, 1)
+    def of(cls, patch: Patch, clicks_px: np.ndarray, z_m: float, scale: float = 1.0, exact: bool = True) -> Clicked:
+        """Of clicks (N, 2) in the image at a depth, on something ``scale`` times as far across as they are.
+
+        exact  whether somebody clicked there: beside a click on an edge is what lies behind it. Points that stand for a
+               box have it around them
+        """
+        centres, seeds = patch.dots(clicks_px, 0), patch.dots(clicks_px, 1)
+        if exact:
+            here_m = cv2.dilate(np.where(centres, patch.depth_m, np.float32(0)), np.ones((3, 3), np.uint8))
+            seeds &= (here_m == 0) | (patch.depth_m - here_m <= patch.step_m)
         at = (clicks_px - [patch.box.left, patch.box.top] + 0.5) / patch.cell_px - 0.5
         hull = np.zeros(patch.shape, np.uint8)
         cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(at).astype(np.int32)[:, None]), 1)
@@ -77,7 +84,7 @@ class Clicked:
         least_m = _EXTENT_M if len(clicks_px) > 1 else _LONE_M
         extent = scale * max(float(np.ptp(at, 0).max()), least_m * patch.camera.fx / z_m / patch.cell_px)
         away = cv2.distanceTransform((~hull).astype(np.uint8), cv2.DIST_L2, 5)
-        return cls(patch.dots(clicks_px, 0), seeds, hull, away / extent, *np.zeros((2, *patch.shape), bool))
+        return cls(centres, seeds, hull, away / extent, *np.zeros((2, *patch.shape), bool))
 
     def within(self, unlike: np.ndarray) -> Clicked:
         """Without what looks like the support, which is most of the hull of a thin thing, unless most clicks do."""
