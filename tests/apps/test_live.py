@@ -273,6 +273,20 @@ def test_a_prompt_of_a_frame_that_never_comes_is_refused(folder):
         track_live(camera, [Prompt("mug", 99, [[1, 1]])], print, RunOptions(settings=SETTINGS))
 
 
+def test_a_camera_that_gives_no_image_is_told_from_a_wrong_frame():
+    class Dark:
+        camera, name = Camera.from_K(K, W, H), "dark"
+
+        def read(self):
+            return None
+
+        def close(self):
+            pass
+
+    with pytest.raises(MissingData, match="camera dark: it gave no image"):
+        track_live(Dark(), [Prompt("mug", 0, [[1, 1]])], print, RunOptions(settings=SETTINGS))
+
+
 def test_a_run_is_kept_and_filmed(folder, tmp_path):
     """What is kept is what was said, and it can be looked at; the film has an image a frame."""
     sequence, got = open_sequence(folder), []
@@ -731,6 +745,7 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
             '{"name": "mug", "points": [[900, 10]]}',
             '{"name": "mug"}',
             '{"mug": [[320, 240]]}',
+            '{"name": "mug", "point": [[320, 240]]}',
             "[]",
             " ",
         ):
@@ -744,12 +759,13 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
         "line: got hello",
         "remove_object: got 'mug', expected one of no objects",
         "clicks on 'mug'",
-        'line: got {"name": "mug"}, expected {"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}',
+        '"points": [[x, y], ...]} or {"remove": "mug"}. Say where it is: points, negative or box.',
+        "Did you mean points?",
         'line: got {"mug": [[320, 240]]}, expected {"name"',
         "line: got []",
     ):
         assert part in said
-    assert len(errors) == 6
+    assert len(errors) == 7
 
 
 @pytest.mark.parametrize("kind", ["tcp", "udp"])

@@ -155,8 +155,22 @@ def K_with(at: tuple[int, int], value: float) -> np.ndarray:
         (CAMERA.K.T, "fx 0 cx 0 fy cy 0 0 1"),
         (K_with((0, 1), 3.0), "fx 0 cx"),
         (K_with((2, 0), 1.0), "fx 0 cx"),
+        (np.array([[0.94, 0, 0.5], [0, 1.25, 0.5], [0, 0, 1]]), "fx = 0.94 for 640 columns, expected .* in pixels"),
     ],
-    ids=["2x2", "3x4", "flat", "nan", "inf", "zero-f", "negative-f", "scale", "transposed", "skew", "last-row"],
+    ids=[
+        "2x2",
+        "3x4",
+        "flat",
+        "nan",
+        "inf",
+        "zero-f",
+        "negative-f",
+        "scale",
+        "transposed",
+        "skew",
+        "last-row",
+        "normalised",
+    ],
 )
 def test_a_bad_matrix_is_refused_and_its_file_named(K, words):
     with pytest.raises(BadInput, match=words) as caught:

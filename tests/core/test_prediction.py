@@ -73,3 +73,20 @@ def test_a_doubted_pose_moves_nothing():
         predictor.add(seen(np.eye(4), k / 30), None)
     predictor.add(seen(se3.exp(np.array([1.0, 0, 0, 0.5, 0, 0])), 1 / 3, confidence=0.5), None)
     np.testing.assert_allclose(predictor.predict("mug", 0.4).T_cam_obj, np.eye(4), atol=1e-9)
+
+
+def test_a_frame_that_misses_its_world_does_not_stop_the_motion():
+    """The camera drives past an object at rest, and the transform of one frame is late; later all are, for too long."""
+    predictor, lies = Predictor(), se3.exp(np.array([0.1, 0.2, 0.3, 0.5, 0.1, 1.0]))
+
+    def drives(k: int) -> np.ndarray:
+        return se3.exp(np.array([0, 0, 0, 0.01 * k, 0, 0]))
+
+    for k in range(80):
+        T_world_cam = drives(k) if k != 12 and k < 40 else None
+        predictor.add(seen(se3.inverse(drives(k)) @ lies, k / 30), T_world_cam)
+        said = predictor.predict("mug", k / 30)
+        if k < 65:
+            np.testing.assert_allclose(said.T_world_obj, lies, atol=1e-6)
+            np.testing.assert_allclose(said.velocity, 0, atol=1e-6)
+    assert said.T_world_obj is None and abs(np.linalg.norm(said.velocity[3:]) - 0.3) < 0.05, "against the camera again"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from p2p_lib.apps.cli import main
 from p2p_lib.core import se3
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, Doubt, MissingData
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.exchange import FORMATS, export, read_poses
@@ -205,6 +205,16 @@ def test_tum_as_scipy_reads_it(table, tmp_path):
     np.testing.assert_allclose(rows[:, 0], open_sequence(table).times_s[seen], atol=1e-6)
     R = Rotation.from_quat(rows[:, 4:]).as_matrix()
     np.testing.assert_allclose(se3.from_rt(R, rows[:, 1:4]), run.objects["can"].T_cam_obj[seen], atol=1e-8)
+
+
+def test_times_of_another_rate_are_doubted(table, tmp_path):
+    """Each lies near some frame's: half of the frames would be lost without a word."""
+    run = run_on(table, tmp_path / "run")
+    export(run, tmp_path / "out", "tum")
+    rows, sequence = (tmp_path / "out" / "can.txt").read_text().splitlines(), open_sequence(table)
+    (tmp_path / "out" / "can.txt").write_text("\n".join(rows[::2]) + "\n")
+    with pytest.warns(Doubt, match="poses 2.0 times as far apart in time as the frames"):
+        read_poses(tmp_path / "out", sequence)
 
 
 def test_bop_csv_as_its_page_says(scene, tmp_path):

@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+import warnings
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import cv2
@@ -12,7 +14,7 @@ import pytest
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, Doubt, MissingData
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.image_sequence import ImageSequence
 from p2p_lib.datasets.models import find_models
@@ -278,6 +280,17 @@ def test_synthetic_sequences_open_by_name_with_their_seed(ycbmultitrack, monkeyp
     assert asked[2:] == [("crossing", 0), ("crossing", 3), ("crossing", 5)], "of older runs the run's"
     with pytest.raises(BadInput, match=r"synthetic/crossing@x: got the seed 'x', expected synthetic/crossing@SEED"):
         open_sequence("synthetic/crossing@x")
+
+
+def test_a_sequence_whose_camera_is_another_one_since_its_run_is_doubted(ycbmultitrack):
+    camera = asdict(open_sequence(ycbmultitrack).camera)
+    info = {"sequence": "own", "path": str(ycbmultitrack), "format": "ycbmultitrack", "seed": 0}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Doubt)
+        reopen(info | {"camera": camera})
+        reopen(info)  # of an older version
+    with pytest.warns(Doubt, match="fx = .* when the run was made. Its poses and meshes are of the camera that it had"):
+        reopen(info | {"camera": camera | {"fx": camera["fx"] / 2}})
 
 
 def test_the_seed_of_a_run_is_no_seed_of_its_scene(ycbmultitrack, monkeypatch, tmp_path):

@@ -203,3 +203,34 @@ def test_people_are_told_what_is_known():
     assert (status_word("occluded", since), status_text("occluded", since)) == ("not found", since)
     assert status_text("occluded", f"out of view: {since}") == f"out of view: {since}"
     assert status_text("occluded", "0 mask pixels") == "occluded: 0 mask pixels"
+
+
+def test_what_a_prompt_selects_too_little_of_says_so_in_every_frame():
+    """A program that goes by the reason learns why its object does not start, until it is told better."""
+    (first, masks), *later = film()[:6]
+    few = np.zeros_like(masks["left"])
+    few[tuple(np.argwhere(masks["left"])[:8].T)] = True
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("left", mask=few)
+        said = [method.step(frame)["left"] for frame in (first, later[0][0])]
+        assert [e.reason for e in said] == ["not seen yet: a mask of 8 pixels, an object starts from 100 on"] * 2
+        given = [method.step(frame, {"left": masks["left"]})["left"] for frame, masks in later[1:]]
+        assert given[-1].status is Status.TRACKED and not given[-1].reason
+
+
+@pytest.mark.filterwarnings("ignore::p2p_lib.core.errors.Doubt")
+def test_what_is_doubtful_about_a_first_mask_is_said_with_the_first_pose_which_is_doubted():
+    (frame, masks), (then, _) = film()[:2]
+    v, u = np.argwhere(masks["left"]).mean(0).astype(int)
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("left", clicks=[[u, v]])
+        method.segmenter.segment, segment = lambda *more: segment(*more), method.segmenter.segment
+        method.step(frame)
+        assert method.segmenter.doubts == {}
+        method.reset()
+        method.add_object("wall", clicks=[[4, 4]])
+        estimate = method.step(frame)["wall"]
+        assert "lie in the plane around them" in method.segmenter.doubts["wall"]
+        assert estimate.T_cam_obj is None or estimate.confidence <= 0.5
+        assert "lie in the plane around them" in estimate.reason
+        assert "in the plane" not in method.step(then)["wall"].reason

@@ -14,8 +14,9 @@ from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.segmenters.builtin import prompted
 from p2p_lib.segmenters.builtin.patch import Box, Patch
-from p2p_lib.segmenters.builtin.prompted import Cut, Cutter, _measured
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cut, Cutter, _measured
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
 
@@ -273,15 +274,30 @@ def test_a_cut_that_leaves_much_of_a_box_is_doubted(monkeypatch, shown, chosen):
     assert (best.whole(frame.shape).sum() > 0.95 * LEFT.sum()) == (chosen == 1.0 or shown > 0.95)
 
 
-def test_what_depth_keeps_apart_lends_no_colour():
-    """One half of a block has the colours of the large one behind it, which a click on that half is near."""
+@pytest.mark.parametrize("behind_m", [0.8, 0.9])
+def test_a_click_at_an_edge_is_not_on_what_lies_behind_it(behind_m):
+    """Three pixels beside it, less than a cell of the coarse grid on which an object is cut out first."""
     rng = np.random.default_rng(0)
-    rgb, depth = np.full((240, 320, 3), 120.0), np.full((240, 320), 1.0)
-    rgb[60:170, 150:250], depth[60:170, 150:250] = (200, 110, 60), 0.9
-    rgb[110:170, 100:150], rgb[110:170, 150:160], depth[110:170, 100:160] = (60, 90, 200), (200, 110, 60), 0.7
+    rgb, depth = np.full((240, 320, 3), 150.0), np.full((240, 320), 1.0)
+    rgb[90:170, 160:230], depth[90:170, 160:230] = (200, 110, 60), behind_m
+    rgb[110:170, 100:160], depth[110:170, 100:160] = (60, 90, 200), 0.7
+    rgb[110:170, 140:160] = 200, 110, 60
     frame = Frame(0, 0.0, np.clip(rgb + rng.normal(0, 6, rgb.shape), 0, 255).astype(np.uint8), depth.astype(np.float32))
-    found = segmenter().segment(frame, [Prompt("block", points_px=[[157, 140], [150, 120], [110, 160]])]) == 1
+    found = segmenter().segment(frame, [Prompt("block", points_px=[[157, 140], [120, 120], [110, 160]])]) == 1
     assert iou(found, rectangle(100, 110, 160, 170)) > 0.9
+
+
+def test_what_depth_keeps_apart_lends_its_colours_to_the_background(monkeypatch):
+    """A block before a wall, clicked near another one: before the first cut that is background, however near it is."""
+    asked, shares = [], prompted.by_shares
+    monkeypatch.setattr(prompted, "by_shares", lambda *more: asked.append(more[:3]) or shares(*more))
+    frame, other = picture(), rectangle(154, 80, 200, 140)
+    frame.depth_m[other] = 0.8
+    cutter = Cutter(frame, CAMERA, preset().segmentation, Prompt("left", points_px=[[145, 110], [100, 90]]), NO_PX)
+    assert iou(cutter.cuts[0].whole(frame.shape), LEFT) > 0.9
+    patch, own, background = asked[0]
+    inner = patch.down(rectangle(164, 90, 190, 130).astype(np.float32)) == 1
+    assert inner.any() and not own[inner].any() and (background[inner] == 1).all()
 
 
 def test_a_box_that_reaches_beyond_the_image_is_cut_to_it():

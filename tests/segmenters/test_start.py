@@ -127,8 +127,9 @@ def test_beside_a_low_camera_the_table_is_found_before_all_that_is_far_behind():
 def test_what_lies_beyond_a_hole_of_depth_is_another_thing_but_within_a_box():
     patch, clicked = block(0.05)
     depth = patch.depth_m.copy()
-    depth[20:40, 54:70], depth[20:40, 50:54] = 0.93, 0
+    depth[20:40, 54:70], depth[16:20, 30:70] = 0.93, 0  # nothing is measured along both of their upper edges
     patch = patch_of(depth)
+    patch.rgb[16:40, 30:70] = 200
     height = Height.of(patch, clicked, EVERYWHERE)
     beside = [by_connection(patch, clicked, height, unlike(patch, height.plane), holes) for holes in (False, True)]
     assert (beside[0][22:38, 56:68] < 0).all() and (beside[1][22:38, 56:68] > 0).all()
