@@ -493,5 +493,5 @@ def _advice(run: Run, job: _Job) -> str:
         fix = "its masks are empty or too small: draw them anew, or use p2p click"
     else:
         fix = "look for faults in the data"
-    first = next(iter(reasons.values()))
+    first = next(iter(reasons.values())).partition(": ")[0]
     return f"{', '.join(reasons)} never had a pose ({first}); {fix}. Next: p2p check {job.source}"

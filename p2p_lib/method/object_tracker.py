@@ -146,9 +146,7 @@ class ObjectTracker:
     def begin(self, obs: Observation) -> ObjectStep:
         """The first frame of a map: fix the object frame and start with the first points."""
         if obs.mask_px is None or self.policy.hidden(obs):
-            most = f": a mask of {obs.mask_px} pixels, an object starts from {self.config.lifecycle.min_mask_px} on"
-            why = "not seen yet" + (WAITS if obs.mask is None else most * bool(obs.mask_px))
-            return self.absent(obs, Verdict(False, Status.INITIALISING, why))
+            return self.absent(obs, Verdict(False, Status.INITIALISING, "not seen yet" + WAITS * (obs.mask is None)))
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < self.config.lifecycle.min_mask_px:
             return self.absent(obs, Verdict(False, Status.INITIALISING, f"only {len(v)} mask pixels with depth"))

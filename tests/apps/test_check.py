@@ -246,7 +246,7 @@ def test_background_share_of_a_disc():
 
 def test_check_prints_findings_and_says_by_its_exit_code(good, tmp_path, capsys):
     assert cli.main(["check", str(good)]) == 0
-    assert capsys.readouterr().out.endswith("Nothing is wrong with it as far as can be seen.\n")
+    assert capsys.readouterr().out.endswith("first_masks.png of a run shows.\n")
     folder = shutil.copytree(good, tmp_path / "spoilt")
     np.savetxt(folder / "cam_K.txt", open_sequence(good).camera.K * [[2], [2], [1]])
     assert cli.main(["check", str(folder)]) == 2
@@ -430,7 +430,9 @@ def test_a_known_size_tells_what_nothing_else_does(good):
     assert check._size("box", length_m, bare, bare.depth_m == 0, CAMERA).level is Level.OPTIONAL, "not measured"
     wide = another_K(open_sequence(good), CAMERA.K * [[0.5, 1, 1], [1, 0.5, 1], [1, 1, 1]])
     finding = found(wide, "box: size", **known)
-    assert finding.level is Level.LOOK and re.search(r"(1\.[5-9]|2\.0)\d? times: focal length", finding.text)
+    assert finding.level is Level.LOOK and re.search(
+        r"(1\.[5-9]|2\.0)\d? times: masks hold more .* or focal length", finding.text
+    )
     assert alarms(check_folder(wide, **known)) == [finding]
     assert frame.index == 0
 

@@ -213,7 +213,7 @@ def test_what_a_prompt_selects_too_little_of_says_so_in_every_frame():
     with Point2Pose(CAMERA, quick()) as method:
         method.add_object("left", mask=few)
         said = [method.step(frame)["left"] for frame in (first, later[0][0])]
-        assert [e.reason for e in said] == ["not seen yet: a mask of 8 pixels, an object starts from 100 on"] * 2
+        assert [e.reason for e in said] == ["not seen yet: a mask of 8 pixels does not start it"] * 2
         given = [method.step(frame, {"left": masks["left"]})["left"] for frame, masks in later[1:]]
         assert given[-1].status is Status.TRACKED and not given[-1].reason
 

@@ -315,15 +315,18 @@ def test_time_that_runs_backwards_is_warned_of_once_and_statuses_are_logged(capl
     assert len(caplog.messages) == changes and {record.name for record in caplog.records} == {"p2p_lib"}
 
 
-@pytest.mark.parametrize("unit_s", [1, 1e-3, 1e-6])
-def test_times_in_another_unit_are_doubted_once(unit_s):
+@pytest.mark.parametrize(
+    ("unit_s", "fix"),
+    [(1, ""), (1e-3, "milliseconds by 1000"), (1e-6, "microseconds by 1e6"), (1e-9, "nanoseconds by 1e9")],
+)
+def test_times_in_another_unit_are_doubted_once(unit_s, fix):
     frames = [(replace(frame, time_s=1.7e9 + frame.time_s / unit_s), masks) for frame, masks in film()[:8]]
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         track(frames, names=("left",))
     about_time = [str(of.message) for of in said if "time of frame" in str(of.message)]
     assert len(about_time) == (unit_s < 1)
-    assert all("time of frame 3: 33" in text and "divide milliseconds by 1000" in text for text in about_time)
+    assert all("time of frame 3: 33" in text and f"divide {fix}." in text for text in about_time)
 
 
 def test_a_mask_where_no_depth_is_says_so_until_it_is_given_again():
