@@ -243,7 +243,8 @@ class Objects(ABC, Generic[FollowedT]):
         if estimate.T_cam_obj is not None and T_world_cam is not None:
             estimate = replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
         if estimate.status is Status.INITIALISING and (said or (mask is not None and mask.any())):
-            few = f": a mask of {np.count_nonzero(mask)} pixels does not start it" * (estimate.reason == "not seen yet")
+            pixels = 0 if mask is None else np.count_nonzero(mask)
+            few = f": a mask of {pixels} pixels does not start it" * (estimate.reason == "not seen yet")
             self._unstarted[name] = estimate.reason + (f": {said}" if said else few)
         reason = self._reason(estimate, frame, mask, given is not None)
         parts = (reason, said * (estimate.T_cam_obj is not None), frame.remark)
