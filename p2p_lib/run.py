@@ -21,7 +21,7 @@ from p2p_lib.core.memory import ObjectMemory, far_fewer_pixels, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar, waiting_for
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import DOUBTED, WITH_POSE, Frame, PoseEstimate, status_text
+from p2p_lib.core.types import DOUBTED, NOT_SEEN, WITH_POSE, Frame, PoseEstimate, status_text
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
@@ -487,9 +487,9 @@ def _advice(run: Run, job: _Job) -> str:
         fix = "show a side that was learnt, or click on it, or it is not in this video"
     elif "depth" in why:
         fix = "its depth is missing, out of range or in another unit (--depth-scale)"
-    elif "not seen yet" in why and not job.masks.every_mask:
+    elif NOT_SEEN in why and not job.masks.every_mask:
         fix = "click on another place, near its centre"
-    elif "not seen yet" in why:
+    elif NOT_SEEN in why:
         fix = "its masks are empty or too small: draw them anew, or use p2p click"
     else:
         fix = "look for faults in the data"

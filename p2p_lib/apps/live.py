@@ -155,9 +155,9 @@ def track_live(
             count.until(options.stop)
         for estimates in method.finish():
             tell(estimates)
-    if prompts and nothing_came:
-        raise MissingData(f"camera {camera.name}", "it gave no image", "Is it connected, and not in use elsewhere?")
     if prompts:
+        if nothing_came:
+            raise MissingData(f"camera {camera.name}", "it gave no image", "Is it connected, and not in use elsewhere?")
         got = f"frame {prompts[0].frame}, which never came"
         raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")
     return count

@@ -20,7 +20,7 @@ from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
 from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
-from p2p_lib.core.types import DOUBTED, NOT_FOUND, OUT_OF_VIEW, Frame, PoseEstimate, Status
+from p2p_lib.core.types import DOUBTED, NOT_FOUND, NOT_SEEN, OUT_OF_VIEW, Frame, PoseEstimate, Status
 
 
 class Followed(Protocol):
@@ -242,9 +242,9 @@ class Objects(ABC, Generic[FollowedT]):
         self._predictor.add(estimate, T_world_cam)
         if estimate.T_cam_obj is not None and T_world_cam is not None:
             estimate = replace(estimate, T_world_obj=T_world_cam @ estimate.T_cam_obj)
-        if estimate.status is Status.INITIALISING and (said or (mask is not None and mask.any())):
-            pixels = 0 if mask is None else np.count_nonzero(mask)
-            few = f": a mask of {pixels} pixels does not start it" * (estimate.reason == "not seen yet")
+        pixels = 0 if mask is None else np.count_nonzero(mask)
+        if estimate.status is Status.INITIALISING and (said or pixels):
+            few = f": a mask of {pixels} pixels does not start it" * (estimate.reason == NOT_SEEN)
             self._unstarted[name] = estimate.reason + (f": {said}" if said else few)
         reason = self._reason(estimate, frame, mask, given is not None)
         parts = (reason, said * (estimate.T_cam_obj is not None), frame.remark)

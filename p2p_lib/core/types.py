@@ -182,6 +182,8 @@ class Status(StrEnum):
 
 #: How the reason of an occlusion begins where the object has left the image, and where nobody knows what hides it.
 OUT_OF_VIEW, NOT_FOUND = "out of view", "not found"
+#: The reason of an object of which nothing has been seen, or too little.
+NOT_SEEN = "not seen yet"
 #: What an object waits for that was added by its name alone.
 WAITS = ": it waits for a mask (step) or for clicks (correct)"
 

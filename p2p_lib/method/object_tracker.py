@@ -18,7 +18,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config
 from p2p_lib.core.interfaces import Detector, Hint
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import OUT_OF_VIEW, WAITS, Frame, PoseEstimate, Status, Tracks
+from p2p_lib.core.types import NOT_SEEN, OUT_OF_VIEW, WAITS, Frame, PoseEstimate, Status, Tracks
 from p2p_lib.method.keypoint_map import KeypointMap
 from p2p_lib.method.object_model import Known, Life, ObjectModel, Requests
 from p2p_lib.method.observation import Observation, Observer
@@ -146,7 +146,7 @@ class ObjectTracker:
     def begin(self, obs: Observation) -> ObjectStep:
         """The first frame of a map: fix the object frame and start with the first points."""
         if obs.mask_px is None or self.policy.hidden(obs):
-            return self.absent(obs, Verdict(False, Status.INITIALISING, "not seen yet" + WAITS * (obs.mask is None)))
+            return self.absent(obs, Verdict(False, Status.INITIALISING, NOT_SEEN + WAITS * (obs.mask is None)))
         v, u = np.nonzero(self.observer.measured(obs))
         if len(v) < self.config.lifecycle.min_mask_px:
             return self.absent(obs, Verdict(False, Status.INITIALISING, f"only {len(v)} mask pixels with depth"))

@@ -137,30 +137,31 @@ class Cutter:
         hides  (H, W) what is known to be before it
         """
         cfg = self.config
-        clicked = Clicked.of(patch, clicks_px, z_m, scale, self.prompt.box_px is None).hidden_by(
-            patch.down(hides) > 0.5
-        )
+        in_box = self.prompt.box_px is not None
+
+        def clicked_on(patch: Patch) -> Clicked:
+            return Clicked.of(patch, clicks_px, z_m, scale, not in_box).hidden_by(patch.down(hides) > 0.5)
+
+        clicked = clicked_on(patch)
         near = by_distance(patch, z_m, cfg)
         height = Height.of(patch, clicked, near >= 0)
         looks = unlike(patch, height.plane)
-        connected = by_connection(patch, clicked, height, looks, self.prompt.box_px is not None)
+        connected = by_connection(patch, clicked, height, looks, in_box)
         connected += self._nearer_to_others(patch, clicked)
         clicked = clicked.within(looks) if height.flat else clicked
         prior, geometry = clicked.prior_beside(connected), near + height.log_odds + connected
         # What depth keeps apart from the clicks lends the object no colour, however near it is, but the background.
         own, other = clicked.near * (connected >= 0), np.maximum(clicked.beyond, connected < 0)
         x = self._cut_out(patch, clicked, prior + self._tolerated(patch, geometry), own, other)
-        whole, there, other = np.zeros((3, *self.frame.shape), np.float32)
-        for image, values in ((whole, x), (there, connected), (other, looks)):
+        whole, there, odd = np.zeros((3, *self.frame.shape), np.float32)
+        for image, values in ((whole, x), (there, connected), (odd, looks)):
             image[patch.box.slices] = patch.up(values)
         fits = self._room(*patch.ends_px(x > 0.5))
         patch = Patch.of(self.frame, fits, self.camera, replace(cfg, side_px=2 * cfg.side_px))
         connected = patch.down(there)
-        clicked = Clicked.of(patch, clicks_px, z_m, scale, self.prompt.box_px is None).hidden_by(
-            patch.down(hides) > 0.5
-        )
+        clicked = clicked_on(patch)
         height = height.on(patch, clicked)
-        clicked = clicked.within(patch.down(other) > 0.5) if height.flat else clicked
+        clicked = clicked.within(patch.down(odd) > 0.5) if height.flat else clicked
         geometry = by_distance(patch, z_m, cfg) + height.log_odds + connected
         fixed, was = clicked.prior_beside(connected) / 2 + self._tolerated(patch, geometry), patch.down(whole)
         x = self._cut_out(patch, clicked, fixed, was, 1 - was, was)

@@ -80,6 +80,7 @@ class BuiltinSegmenter:
     def remove(self, name: str) -> None:
         """Forget an object."""
         del self._targets[name]
+        self.doubts.pop(name, None)
 
     def segment(
         self,
