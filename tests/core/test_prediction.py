@@ -90,3 +90,13 @@ def test_a_frame_that_misses_its_world_does_not_stop_the_motion():
             np.testing.assert_allclose(said.T_world_obj, lies, atol=1e-6)
             np.testing.assert_allclose(said.velocity, 0, atol=1e-6)
     assert said.T_world_obj is None and abs(np.linalg.norm(said.velocity[3:]) - 0.3) < 0.05, "against the camera again"
+
+
+def test_what_is_not_seen_is_predicted_in_the_camera_of_the_newest_frame():
+    predictor, lies = Predictor(), se3.exp(np.array([0.1, 0.2, 0.3, 0.5, 0.1, 1.0]))
+    turns = [se3.exp(np.array([0, 0.02 * k, 0, 0, 0, 0])) for k in range(15)]
+    for k, T_world_cam in enumerate(turns):
+        hidden = PoseEstimate("mug", k, k / 30, Status.OCCLUDED)
+        predictor.add(seen(se3.inverse(T_world_cam) @ lies, k / 30) if k < 10 else hidden, T_world_cam)
+    said = predictor.predict("mug", 14 / 30)
+    np.testing.assert_allclose(said.T_cam_obj, se3.inverse(turns[-1]) @ lies, atol=1e-6)

@@ -1306,3 +1306,12 @@ def test_questions_change_nothing():
         lump.outlook.misplaced(obs, obs.mask)
         lump.tracker.awaited(obs.mask)
     np.testing.assert_array_equal(lump.see(turned(4)).estimate.T_cam_obj, other.see(turned(4)).estimate.T_cam_obj)
+
+
+def test_a_pose_that_is_doubted_for_its_turn_alone_says_so():
+    lump = settled(begun(), range(2, 40, 2))
+    assert lump.see(turned(40)).estimate.confidence > 0.5
+    lump.tracker.life = replace(lump.tracker.life, doubted=True)
+    estimate = lump.see(turned(42)).estimate
+    assert estimate.status is Status.TRACKED and estimate.confidence == 0.5
+    assert estimate.reason == "its turn is not told yet from others that look alike"

@@ -19,6 +19,7 @@ from p2p_lib.segmenters.builtin.patch import Box, Patch
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cut, Cutter, _measured
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
+from p2p_lib.segmenters.builtin.start_evidence import Clicked
 
 CAMERA = Camera(300.0, 310.0, 158.3, 121.7, 320, 240)
 
@@ -298,6 +299,19 @@ def test_what_depth_keeps_apart_lends_its_colours_to_the_background(monkeypatch)
     patch, own, background = asked[0]
     inner = patch.down(rectangle(164, 90, 190, 130).astype(np.float32)) == 1
     assert inner.any() and not own[inner].any() and (background[inner] == 1).all()
+
+
+@pytest.mark.parametrize("in_box", [False, True])
+def test_within_a_box_points_stand_for_what_is_around_them_and_holes_do_not_end_it(monkeypatch, in_box):
+    """A click is exact, and what lies beyond a hole of depth may be another thing."""
+    told, of, by = {}, Clicked.of, prompted.by_connection
+    monkeypatch.setattr(
+        Clicked, "of", lambda patch, px, z_m, *more: told.update(exact=more[1:]) or of(patch, px, z_m, *more)
+    )
+    monkeypatch.setattr(prompted, "by_connection", lambda *more: told.update(holes=more[4:]) or by(*more))
+    prompt = Prompt("left", box_px=(90, 80, 150, 140)) if in_box else Prompt("left", points_px=[[110, 100], [120, 110]])
+    assert Cutter(picture(), CAMERA, preset().segmentation, prompt, NO_PX).cuts
+    assert told == {"exact": (not in_box,), "holes": (in_box,)}
 
 
 def test_a_box_that_reaches_beyond_the_image_is_cut_to_it():
