@@ -207,14 +207,17 @@ def test_people_are_told_what_is_known():
 
 def test_what_a_prompt_selects_too_little_of_says_so_in_every_frame():
     """A program that goes by the reason learns why its object does not start, until it is told better."""
-    (first, masks), *later = film()[:6]
+    (first, masks), *later = film()[:7]
     few = np.zeros_like(masks["left"])
     few[tuple(np.argwhere(masks["left"])[:8].T)] = True
     with Point2Pose(CAMERA, quick()) as method:
         method.add_object("left", mask=few)
         said = [method.step(frame)["left"] for frame in (first, later[0][0])]
         assert [e.reason for e in said] == ["not seen yet: a mask of 8 pixels does not start it"] * 2
-        given = [method.step(frame, {"left": masks["left"]})["left"] for frame, masks in later[1:]]
+        method.correct("left", mask=np.zeros_like(few))
+        assert method.step(later[1][0])["left"].reason == "not seen yet", "that was said of something else"
+        given = [method.step(frame, {"left": masks["left"]})["left"] for frame, masks in later[2:]]
+        assert given[0].reason == "still coming into view"
         assert given[-1].status is Status.TRACKED and not given[-1].reason
 
 
