@@ -234,12 +234,13 @@ def test_what_is_doubtful_about_a_first_mask_is_said_with_the_first_pose_which_i
 
 
 @pytest.mark.filterwarnings("ignore::p2p_lib.core.errors.Doubt")
-def test_what_was_doubted_is_forgotten_with_its_object():
+@pytest.mark.parametrize("at", [(160, 20), (4, 4)], ids=["it started", "too little to start"])
+def test_what_was_doubted_is_forgotten_with_its_object(at):
     """Nobody asks the segmenter while it has no objects: what it said of one that is gone is of no other."""
     (frame, _), (then, _) = film()[:2]
     with Point2Pose(CAMERA, quick()) as method:
-        method.add_object("wall", clicks=[[160, 20]])
+        method.add_object("wall", clicks=[at])
         method.step(frame)
         method.remove_object("wall")
         method.add_object("wall")
-        assert "in the plane" not in method.step(then)["wall"].reason
+        assert method.step(then)["wall"].reason == "not seen yet: it waits for a mask (step) or for clicks (correct)"
