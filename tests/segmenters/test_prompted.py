@@ -15,6 +15,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin import prompted
+from p2p_lib.segmenters.builtin import segmenter as built_in
 from p2p_lib.segmenters.builtin.patch import Box, Patch
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cut, Cutter, _measured
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
@@ -470,3 +471,15 @@ def test_what_selects_nothing_leaves_an_object_its_mask(say):
     with pytest.warns(Doubt, match=r"'left' in frame 1: no object was found there\. It keeps the mask that it had\."):
         kept = follow.segment(Frame(1, 1 / 30, frame.rgb, speck), [Prompt("left", 1, **say)]) == 1
     assert iou(kept, LEFT) > 0.9 and iou(follow.segment(picture(2)) == 1, LEFT) > 0.9
+
+
+def test_doubts_are_of_what_a_prompt_has_started_alone(monkeypatch):
+    """What is said of a correction says nothing of how the object began."""
+    monkeypatch.setattr(built_in, "doubt_prompt", lambda cutter, *more: "odd")
+    cutter = segmenter()
+    cutter.segment(picture(), [Prompt("left", points_px=[[120, 110]])])
+    assert cutter.doubts == {"left": "odd"}
+    cutter.segment(picture(1), [Prompt("left", points_px=[[121, 111]]), Prompt("right", points_px=[[174, 109]])])
+    assert cutter.doubts == {"right": "odd"}
+    cutter.segment(picture(2))
+    assert cutter.doubts == {}
