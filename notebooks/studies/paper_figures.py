@@ -19,6 +19,7 @@ from pandas import DataFrame
 from PIL import Image
 
 from p2p_lib.benchmark.benchmark import Benchmark
+from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.exchange import as_run, read_poses
@@ -43,7 +44,14 @@ _TWO_BY_TWO = {
     "scene alone": "Ours, SH(10)",
     "neither": "Ours, points alone, SH(10)",
 }
-_AIRPLANE, _HIDDEN = "synthetic/ycb_airplane_can", "synthetic/occlusion"
+_THREE, _AIRPLANE, _HIDDEN = "synthetic/three_objects", "synthetic/ycb_airplane_can", "synthetic/occlusion"
+#: What each is drawn from.
+_DRAWN_FROM = {
+    "fig1_three_objects": _THREE,
+    "fig2_framework": _THREE,
+    "fig3_synthetic": _AIRPLANE,
+    "fig5_return": _HIDDEN,
+}
 _OTHER = "stand-in: rendered, not the paper's sequence"
 _RIVAL = "A return: ours above, a competitor's poses below."
 _RETURN = (
@@ -59,6 +67,13 @@ def picked(only: Collection[str] = ()) -> list[str]:
         if name not in known:
             raise BadInput("figures --only", name, f"names of {', '.join(known)}", did_you_mean(name, known))
     return [name for name in known if name in only or not only]
+
+
+def plan_for(names: Collection[str]) -> Plan:
+    """The runs that the figures of these names are drawn from."""
+    plan, wanted = read_plan(PLAN), {_DRAWN_FROM.get(name) for name in names}
+    kept = [sequence for sequence in plan.full.sequence if sequence.name in wanted]
+    return plan.model_copy(update={"full": plan.full.model_copy(update={"sequence": kept})})
 
 
 def draw_all(runs: Benchmark, folder: Path, names: Collection[str], poses: Path | None = None) -> list[Saved]:
@@ -84,7 +99,7 @@ def draw_all(runs: Benchmark, folder: Path, names: Collection[str], poses: Path 
 
 def three_objects(runs: Benchmark) -> np.ndarray:
     """The paper's first figure: three objects through occlusion, and back."""
-    scene = scene_of(runs, _OURS, "synthetic/three_objects")
+    scene = scene_of(runs, _OURS, _THREE)
     return _marked(scene.story(8, 4, 300), _OTHER)
 
 
@@ -123,7 +138,7 @@ def imported(poses: Path, video: Sequence) -> Run:
 
 def framework(runs: Benchmark) -> np.ndarray:
     """The stages as a diagram, and below it one frame: image, depth, masks, tracked points, surfaces, poses."""
-    scene = scene_of(runs, _OURS, "synthetic/three_objects")
+    scene = scene_of(runs, _OURS, _THREE)
     run, video = scene.run, scene.sequence
     playback = Playback.of(run, video)
     row = len(playback) - 1

@@ -27,6 +27,7 @@ from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.options import lengths_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, evenly
+from p2p_lib.datasets import first_masks as drawing
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera, sees
@@ -79,12 +80,14 @@ def check_folder(
     depth_scale: float | None = None,
     config: Config | None = None,
     sizes: Mapping[str, Any] | None = None,
+    picture: Path | None = None,
 ) -> list[Finding]:
     """What is right and wrong with a sequence, in the order in which it should be mended.
 
     prompts  clicks, for a sequence without masks: the built-in segmenter makes its first ones
     config   whose limits count (default: the preset ``default``)
     sizes    how long objects are known to be, cm: what was measured is compared with it
+    picture  file that the first masks are drawn into, as ``first_masks.png`` of a run
 
     Files that are missing or cannot be read are findings too, all that can be told without each other.
     """
@@ -120,6 +123,10 @@ def check_folder(
         except P2PError as error:
             firsts = {}
             wrong.append(_unreadable("clicks" if prompts else "masks", error))
+    if picture is not None and firsts:
+        drawn = drawing.FirstMasks(picture, prompts)
+        for first in {frame.index: frame for frame, _ in firsts.values()}.values():
+            drawn.add(first, {name: mask for name, (frame, mask) in firsts.items() if frame.index == first.index})
     sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects)
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
@@ -231,7 +238,7 @@ def _files(folder: Path) -> list[Finding]:
     first("depth", images.DEPTH, images.read_raw_depth)
     if not wrong:
         look("depth/", "", lambda: paired_images(folder))
-    look("cam_K.txt", "", lambda: Camera.from_K(read_K(folder), 1, 1, "cam_K.txt"))
+    look("cam_K.txt", "", lambda: Camera.from_K(read_K(folder)[0], 1, 1, "cam_K.txt"))
     for path in (path for path in (folder / "times.txt", folder / "depth_scale.txt") if path.exists()):
         look(path.name, "It is optional: correct it or remove it.", partial(images.read_numbers, path, "numbers"))
     return wrong
@@ -429,7 +436,8 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
     if np.isnan(shares).all():
         return Finding(f"{name}: mask", Level.OPTIONAL, "no depth along its rim to judge it by")
     typical = float(np.nanmedian(shares))
-    text = f"{100 * typical:.0f} % of its rim lies on the background (median of {len(shares)} masks)"
+    of = f" (median of {len(shares)} masks)" if len(shares) > 1 else ""
+    text = f"{100 * typical:.0f} % of its rim lies on the background{of}"
     if typical > RIM_SHARE:
         worst = seen[int(np.nanargmax(shares))][0].index
         fix = f"Draw it to the object's edge or a little inside; frame {worst} is the worst."

@@ -56,6 +56,7 @@ def _click(a: argparse.Namespace) -> None:
     "look at data of your own: what is wrong with it and what to do",
     arg("sequence", metavar="FOLDER", help="rgb/ depth/ cam_K.txt masks/, or any sequence"),
     run_options("format", "depth_scale", "sizes", prompts="clicks, where there are no masks"),
+    output("FILE.png", "a picture of the first masks, which a run would begin with"),
     JSON,
 )
 def _check(a: argparse.Namespace) -> int:
@@ -63,10 +64,13 @@ def _check(a: argparse.Namespace) -> int:
     from p2p_lib.core.findings import Level, as_lines
     from p2p_lib.datasets.prompts import load_prompts
 
+    if a.out is not None and a.out.suffix.lower() != ".png":
+        raise BadInput("--out", a.out.name, "the name of a picture, FILE.png")
     prompts = load_prompts(a.prompts) if a.prompts else ()
     how = {"format": a.format, "depth_scale": a.depth_scale, "sizes": RunOptions.of_arguments(a).sizes}
-    findings = check_folder(a.sequence, prompts=prompts, **how)
-    fine = "Nothing is wrong with it as far as can be seen. Whether masks are objects, first_masks.png of a run shows."
+    findings = check_folder(a.sequence, prompts=prompts, picture=a.out, **how)
+    fine = "Nothing is wrong with it as far as can be seen. Whether masks are objects, "
+    fine += f"{a.out} shows." if a.out else "a picture of them shows: --out FILE.png, or first_masks.png of a run."
     print(json.dumps([asdict(f) for f in findings]) if a.json else as_lines(findings, fine))
     return P2PError.exit_code if any(f.level is Level.WRONG for f in findings) else 0
 

@@ -229,7 +229,7 @@ def _stale(a: argparse.Namespace) -> int:
     arg(
         "--only",
         metavar="fig1_three_objects,runtime",
-        help="these pictures alone, by their names; the runs are those of all",
+        help="these pictures alone, by their names, and the runs that they need",
     ),
     arg(
         "--poses",
@@ -241,15 +241,17 @@ def _stale(a: argparse.Namespace) -> int:
 )
 def _figures(a: argparse.Namespace) -> None:
     from p2p_lib.apps.clone import study
-    from p2p_lib.benchmark import run_benchmarks
+    from p2p_lib.benchmark import load_benchmark, run_benchmarks
     from p2p_lib.core.paths import benchmark_dir, figure_dir
 
     figures = study("paper_figures")
     drawn = figures.picked(names(a.only) or ())  # what does not fit is said before anything runs
-    (runs,) = run_benchmarks([figures.PLAN], a.out or benchmark_dir("full"), progress=not a.quiet)
-    if runs.interrupted:
+    out = a.out or benchmark_dir("full")
+    (ran,) = run_benchmarks([figures.plan_for(drawn)], out, progress=not a.quiet)
+    if ran.interrupted:
         raise KeyboardInterrupt
-    for saved in figures.draw_all(runs, a.figures or figure_dir(), drawn, a.poses):
+    # Drawn from the whole plan, which is what their notes name.
+    for saved in figures.draw_all(load_benchmark(figures.PLAN, out), a.figures or figure_dir(), drawn, a.poses):
         print(saved.path)
 
 

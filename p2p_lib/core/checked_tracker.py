@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ class CheckedTracker:
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
         self._frame = frame.index
-        return self._checked("track()", self._tracker.track(frame, search, urgent))
+        return self._checked("track()", lambda: self._tracker.track(frame, search, urgent))
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
@@ -73,11 +74,18 @@ class CheckedTracker:
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Handed on; the newest frame's tracks, or None."""
-        found = self._tracker.suggest(ids, uv_px)
-        return None if found is None else self._checked("suggest()", found)
+        return self._checked("suggest()", lambda: self._tracker.suggest(ids, uv_px), or_none=True)
 
-    def _checked(self, call: str, tracks: Tracks) -> Tracks:
+    def _checked(self, call: str, answer: Callable[[], Any], or_none: bool = False) -> Any:
         """Tracks with a row for each live query, sorted, of which what is visible is somewhere."""
+        try:
+            tracks = answer()
+        except BadInput as error:
+            if error.name != Tracks.__name__:
+                raise
+            raise self._bad(call, str(error.got), error.expected) from None
+        if tracks is None and or_none:
+            return None
         if not isinstance(tracks, Tracks):
             raise self._bad(call, kind_of(tracks), "Tracks(ids, uv_px, visible, uncertainty)")
         for name, (kinds, called) in _COLUMNS.items():

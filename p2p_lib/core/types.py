@@ -116,7 +116,7 @@ class Tracks:
         shapes = np.shape(self.uv_px), np.shape(self.visible), np.shape(self.uncertainty)
         if shapes != ((n, 2), (n,), (n,)):
             got = "uv_px {}, visible {}, uncertainty {}".format(*shapes)
-            raise BadInput("tracks", f"{n} ids, {got}", "(N,), (N, 2), (N,), (N,)")
+            raise BadInput(Tracks.__name__, f"{n} ids, {got}", "(N,), (N, 2), (N,), (N,)")
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -6,18 +6,27 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData, advised
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.masks import MaskFiles, find_masks
+from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import ObjectTruth
 
 #: What to do without a camera matrix.
 WRITE_K = "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images."
+#: What Open3D's recorders call theirs.
+INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
+
+
+class _Intrinsic(BaseModel):
+    intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
 
 
 def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], tuple[Path, ...]]:
@@ -163,13 +172,19 @@ class ImageSequence:
 def image_files(folder: Path) -> ImageSequence:
     """The sequence in a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
     rgb, depth = paired_images(folder)
-    camera = camera_for(rgb, read_K(folder), str(folder / "cam_K.txt"))
-    return ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
+    return ImageSequence(folder, rgb, depth, camera_for(rgb, *read_K(folder)), images.frame_times(folder, rgb))
 
 
-def read_K(folder: Path) -> np.ndarray:
-    """(3, 3) the camera matrix in ``cam_K.txt``, in three lines or in one; errors say what to write."""
+def read_K(folder: Path) -> tuple[np.ndarray, str]:
+    """The camera matrix (3, 3) and its file; errors say what to write.
+
+    That is ``cam_K.txt``, in three lines or in one, or where there is none the JSON that Open3D's recorders write.
+    """
     path, expected = folder / "cam_K.txt", "a 3x3 camera matrix in pixels"
+    recorded = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
+    if recorded is not None and not path.is_file():
+        lens = read_json(recorded, _Intrinsic, "a pinhole camera as Open3D writes it")
+        return np.array(lens.intrinsic_matrix).reshape(3, 3).T, str(recorded)  # it is written column by column
     try:
         K = images.read_numbers(path, expected)
     except MissingData as error:
@@ -177,4 +192,4 @@ def read_K(folder: Path) -> np.ndarray:
     if K.size != 9:
         decimals = "A comma parts numbers: write decimals with a point, as 913.05."
         raise BadInput(str(path), f"{K.size} numbers", expected, decimals if K.size == 18 else WRITE_K)
-    return K.reshape(3, 3)
+    return K.reshape(3, 3), str(path)

@@ -38,7 +38,7 @@ HEADS = {
     "add_auc_voc": "ADD AUC, VOC [%]",
 }
 #: Sources of masks that do not tell when an object is back.
-NOT_TOLD = ("clicks", "first")
+NOT_TOLD = ("clicks", "first", None)
 #: What a score says of the run.
 WHAT_RAN = ("tracker", "masks", "segmenter", "preset", "seed")
 
@@ -123,7 +123,8 @@ class Evaluation:
         lines += [f"{name}: not scored, {reason}" for name, reason in self.left_out.items()]
         if self.hz is not None:
             lines.append(f"{self.hz:.1f} Hz, 95 % of the frames within {self.p95_ms:.1f} ms")
-        ran = ", ".join(f"{key} {value}" for key, value in ran_with(self.info).items())
+        # Of imported poses no more is known than whose they are.
+        ran = ", ".join(f"{key} {value}" for key, value in ran_with(self.info).items() if value is not None)
         return "\n".join(["AUC over 0 to 0.1 m, exact and in the VOC form", *lines, f"{ran}, aligned by {self.align}"])
 
 

@@ -21,7 +21,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import background_share, misfit
 from p2p_lib.datasets.image_sequence import WRITE_K
-from p2p_lib.datasets.images import SKIP_BAD
+from p2p_lib.datasets.images import SKIP_BAD, read_rgb
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.runs import load_run
@@ -246,7 +246,14 @@ def test_background_share_of_a_disc():
 
 def test_check_prints_findings_and_says_by_its_exit_code(good, tmp_path, capsys):
     assert cli.main(["check", str(good)]) == 0
-    assert capsys.readouterr().out.endswith("first_masks.png of a run shows.\n")
+    assert capsys.readouterr().out.endswith("--out FILE.png, or first_masks.png of a run.\n")
+    assert cli.main(["check", str(good), "--out", str(tmp_path / "seen.png")]) == 0
+    assert capsys.readouterr().out.endswith(f"Whether masks are objects, {tmp_path}/seen.png shows.\n")
+    video = open_sequence(good)
+    whole = read_rgb(tmp_path / "seen.png")
+    assert whole.shape[0] >= video.camera.height and whole.shape[1] > video.camera.width, "beside it, each object"
+    assert cli.main(["check", str(good), "--out", str(tmp_path / "seen.jpg")]) == 2
+    assert "got seen.jpg, expected the name of a picture, FILE.png" in capsys.readouterr().err
     folder = shutil.copytree(good, tmp_path / "spoilt")
     np.savetxt(folder / "cam_K.txt", open_sequence(good).camera.K * [[2], [2], [1]])
     assert cli.main(["check", str(folder)]) == 2

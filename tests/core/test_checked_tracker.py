@@ -104,6 +104,11 @@ BROKEN = {
         lambda uv: uv * np.nan,
         r"track\(\): got 4 of 4 visible points at no pixel, the first",
     ),
+    "columns of unequal length": (
+        "visible",
+        lambda seen: seen[1:],
+        r"track\(\): got 4 ids, uv_px \(4, 2\), visible \(3,\), uncertainty \(4,\), expected",
+    ),
     "unsure": ("uncertainty", lambda unsure: unsure + 2, r"track\(\): got uncertainty 2 of a visible point, expected"),
 }
 

@@ -114,7 +114,7 @@ def test_select_refuses_ids_that_are_not_there(held, wanted):
 def test_rows_must_belong_together(field):
     values = dataclasses.asdict(some_tracks([1, 2, 3]))
     values[field] = values[field][:-1]
-    with pytest.raises(BadInput, match=rf"tracks: got 3 ids.*{field} \(2"):
+    with pytest.raises(BadInput, match=rf"Tracks: got 3 ids.*{field} \(2"):
         Tracks(**values)
 
 

@@ -120,9 +120,15 @@ def test_open3ds_recordings_are_read_as_open3d_reads_them(tmp_path):
     open3d.io.write_pinhole_camera_intrinsic(str(folder / "camera_intrinsic.json"), lens)
     assert open_sequence(folder).format == "open3d"
     same(open_sequence(folder))
+    (folder / "color").rename(folder / "rgb")  # as whoever has read the README calls it
+    assert open_sequence(folder).format == "folder"
+    same(open_sequence(folder))
+    (folder / "rgb").rename(folder / "color")
     (folder / "camera_intrinsic.json").unlink()
     with pytest.raises(MissingData, match=r"intrinsic\.json, as Open3D's layout .*name that with --format"):
         open_sequence(folder)
+    np.savetxt(folder / "cam_K.txt", K)
+    same(open_sequence(folder))
 
 
 FLOATS = {

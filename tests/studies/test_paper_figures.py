@@ -20,7 +20,7 @@ from p2p_lib.figures import provenance
 from p2p_lib.figures.provenance import save_figure
 from studies import anew, paper_figures
 from studies.final_figures import rate_figure
-from studies.paper_figures import ITEMS, PLAN, draw_all, index, picked
+from studies.paper_figures import ITEMS, PLAN, draw_all, index, picked, plan_for
 
 FIGURES = PROJECT / "figures"
 
@@ -175,6 +175,8 @@ def test_the_rate_figure_shows_every_number_of_its_table(drawn):
 
 def test_figures_that_are_asked_for_are_drawn_where_they_are_asked_for(tmp_path, monkeypatch):
     assert picked(["runtime"]) == ["runtime"] and len(picked()) == 5
+    assert [s.name for s in plan_for(["fig3_synthetic", "runtime"]).full.sequence] == ["synthetic/ycb_airplane_can"]
+    assert plan_for(picked()) == read_plan(PLAN)
     monkeypatch.setenv("P2P_FIGURES", str(tmp_path / "as_they_were"))
     monkeypatch.setattr(paper_figures, "framework", lambda runs: np.zeros((4, 4, 3), np.uint8))
     saved = draw_all(load_benchmark(PLAN, tmp_path), tmp_path / "mine", ["fig2_framework", "runtime"])
