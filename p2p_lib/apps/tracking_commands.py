@@ -109,6 +109,8 @@ def _run(a: argparse.Namespace) -> int:
     if result.look_at:
         title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
         print("\n".join([title, *(f"  {line}" for line in said_once(result.look_at))]))
+    elif result.tracked:
+        print("Nothing is suspicious by some of the images (p2p eval takes more of them).")
     first = a.out / FIRST_MASKS
     results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:

@@ -1075,6 +1075,8 @@ def test_what_is_suspicious_is_said_at_the_end_kept_and_said_again(sequence, tmp
     assert told["doubts"][0] in told["look_at"]["wall"]
     assert "What to look at before it is believed, by some of the images" in said
     assert all(f"  wall: {text}" in said for text in told["look_at"]["wall"])
+    assert run(sequence, tmp_path / "fine", "--masks", "dataset") == 0
+    assert "Nothing is suspicious by some of the images" in capsys.readouterr().out
     assert cli.main(["eval", str(out), "--json"]) == 0
     judged = json.loads(capsys.readouterr().out)["objects"]["wall"]
     assert judged["verdict"] == "look" and told["doubts"][0] in [found["text"] for found in judged["look_at"]]
