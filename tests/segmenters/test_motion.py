@@ -206,6 +206,10 @@ def test_where_the_wall_was_seen_through_it_is_not_the_object():
     assert not free_before(patch, both)[plate | part].any()
     free = free_before(patch, later)
     assert free[part].mean() > 0.7 and not free[plate].any()
+    come = before.rgb.copy(), before.depth_m.copy()  # someone stood before most of the scene
+    come[0][:, :200], come[1][:, :200] = _texture(4)[:, :200], np.where(empty, WALL_M, 0.9)[:, :200]
+    crowded = Motions(now, both.recent, ((Frame(0, 0.0, *come), both.recent[1]),))
+    assert free_before(patch, crowded)[part].mean() > 0.7
     turned = before.rgb[:, ::-1].copy(), before.depth_m[:, ::-1].copy()  # and from where the camera is no more
     elsewhere = Motions(now, both.recent, ((Frame(0, 0.0, *turned), both.recent[1]),))
     assert not free_before(patch, elsewhere).any()

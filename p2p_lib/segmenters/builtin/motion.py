@@ -25,8 +25,10 @@ _AT_THE_BORDER = 0.02
 EVERY, _KEPT = 5, 6
 #: Something was seen through if what is behind is so many steps of depth farther, over so many cells across.
 _FAR_BEHIND, _THICK = 4.0, 5
-#: One row and column in so many of the scene is looked at.
-_SCENE_STRIDE = 24
+#: Of the scene so many columns are looked at, and rows as far apart.
+_SCENE_COLUMNS = 26
+#: The camera stayed where it was if in so many of the image's tiles, this many a side, more than so much did.
+_TILES, _TILES_THAT_STAY, _TILE_STAYS = 4, 0.25, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,7 @@ def free_before(patch: Patch, motions: Motions) -> np.ndarray:
     """
     p_cam, free, scene = patch.points(), np.zeros(patch.shape, bool), _scene_around(patch, motions.now)
     for then, T_then_now in motions.compared:
-        if _stayed(scene, patch.camera, then):
+        if _camera_stayed(*scene, patch.camera, then):
             _, behind_m, step_m = _looked_at(p_cam, patch.camera, then, T_then_now)
             free |= behind_m > _FAR_BEHIND * step_m
     free &= patch.depth_m > 0
@@ -130,16 +132,21 @@ def _scene_around(patch: Patch, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Some points (N, 3) of a frame around a patch, in the camera's frame, and their colours (N, 3)."""
     around = np.ones(frame.shape, bool)
     around[patch.box.slices] = False
-    v, u = np.mgrid[: frame.shape[0] : _SCENE_STRIDE, : frame.shape[1] : _SCENE_STRIDE]
+    stride = max(frame.shape[1] // _SCENE_COLUMNS, 1)
+    v, u = np.mgrid[: frame.shape[0] : stride, : frame.shape[1] : stride]
     some = around[v, u] & (frame.depth_m[v, u] > 0)
     v, u = v[some], u[some]
     return patch.camera.unproject(np.stack([u, v], -1), frame.depth_m[v, u]), frame.rgb[v, u]
 
 
-def _stayed(scene: tuple[np.ndarray, np.ndarray], camera: Camera, then: Frame) -> bool:
-    """Whether points of the scene were at the same places of an earlier image."""
-    p_cam, rgb = scene
-    return len(p_cam) >= _FEWEST and agrees(p_cam, rgb, camera, then, np.eye(4)).mean() > _STAYS
+def _camera_stayed(p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Frame) -> bool:
+    """Whether points of the scene were at the same places of an earlier image, but for where people are."""
+    v, u = np.moveaxis(camera.project(p_cam)[:, ::-1] / then.shape * _TILES, -1, 0).astype(int)
+    tile = v * _TILES + u
+    count = np.bincount(tile, minlength=_TILES**2)
+    same = np.bincount(tile, agrees(p_cam, rgb, camera, then, np.eye(4)), _TILES**2)
+    share = (same / np.maximum(count, 1))[count >= _FEWEST]
+    return len(share) > 0 and float(np.quantile(share, 1 - _TILES_THAT_STAY)) > _TILE_STAYS
 
 
 def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
