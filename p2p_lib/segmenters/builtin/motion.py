@@ -25,8 +25,8 @@ _AT_THE_BORDER = 0.02
 EVERY, _KEPT = 5, 6
 #: Something was seen through if what is behind is so many steps of depth farther, over so many cells across.
 _FAR_BEHIND, _THICK = 4.0, 5
-#: Of the scene so many columns are looked at, and rows as far apart.
-_SCENE_COLUMNS = 26
+#: One row and column in so many of the scene is looked at, in a small image more of them: so many columns at least.
+_SCENE_STRIDE, _SCENE_COLUMNS = 24, 26
 #: The camera stayed where it was if in so many of the image's tiles, this many a side, more than so much did.
 _TILES, _TILES_THAT_STAY, _TILE_STAYS = 4, 0.25, 0.9
 
@@ -132,7 +132,7 @@ def _scene_around(patch: Patch, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Some points (N, 3) of a frame around a patch, in the camera's frame, and their colours (N, 3)."""
     around = np.ones(frame.shape, bool)
     around[patch.box.slices] = False
-    stride = max(frame.shape[1] // _SCENE_COLUMNS, 1)
+    stride = max(min(frame.shape[1] // _SCENE_COLUMNS, _SCENE_STRIDE), 1)
     v, u = np.mgrid[: frame.shape[0] : stride, : frame.shape[1] : stride]
     some = around[v, u] & (frame.depth_m[v, u] > 0)
     v, u = v[some], u[some]
