@@ -18,8 +18,8 @@ from p2p_lib.extended.default import Point2Pose
 
 #: What a line says.
 FORM = '{"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}'
-#: A reader that takes no line for so long is no longer there, s.
-_GONE_S = 0.5
+#: A reader that takes no line for so long is no longer there, and is looked for again every so often, s.
+_GONE_S, _AGAIN_S = 0.5, 1.0
 
 
 class Words:
@@ -76,7 +76,8 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
     else:
         known = isinstance(message, dict) and "name" in message
         odd = sorted(message.keys() - KEYS) if known else []
-        fix = did_you_mean(odd[0], KEYS) if odd else "Say where it is: points, negative or box." if known else ""
+        where = f"Say where it is: {', '.join(sorted(KEYS - {'name', 'frame'}))}."
+        fix = f"{odd[0]!r} is not known. {did_you_mean(odd[0], KEYS) or where}" if odd else where if known else ""
         raise BadInput("line", line.strip()[:60], FORM, fix)
     return [(prompt.name, prompt) for prompt in prompts]
 
@@ -85,22 +86,36 @@ def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
 def outlet(to: str, say: Callable[[str], object]) -> Iterator[Callable[[str], None]]:
     """What sends lines to ``tcp://HOST:PORT`` or, one a datagram, to ``udp://HOST:PORT``.
 
-    A reader that goes away, or takes no line for half a second, is given up, which is said once: tracking goes on.
+    Tracking goes on where a reader goes away, or takes no line for half a second: that is said, the lines are lost, and
+    another one that listens there gets those from then on.
     """
-    with _connected(to) as reader:
+    reader, ended = _connected(to), threading.Event()
 
-        def send(line: str) -> None:
-            if reader.fileno() < 0:  # given up
+    def look_again() -> None:
+        nonlocal reader
+        while not ended.wait(_AGAIN_S):
+            with suppress(P2PError):
+                reader = _connected(to)
+                say(f"{to} takes lines again.")
                 return
-            try:
-                reader.sendall(f"{line}\n".encode())
-            except OSError as error:
-                if reader.type == socket.SOCK_DGRAM and not isinstance(error, TimeoutError):
-                    return  # nobody listens yet, or any more: datagrams are for whoever is there
-                say(f"{to} takes no more lines ({in_a_line(error)}); tracking goes on.")
-                reader.close()
 
+    def send(line: str) -> None:
+        if reader.fileno() < 0:  # gone
+            return
+        try:
+            reader.sendall(f"{line}\n".encode())
+        except OSError as error:
+            if reader.type == socket.SOCK_DGRAM and not isinstance(error, TimeoutError):
+                return  # nobody listens yet, or any more: datagrams are for whoever is there
+            say(f"{to} takes no more lines ({in_a_line(error)}); tracking goes on, and a reader is waited for.")
+            reader.close()
+            threading.Thread(target=look_again, daemon=True).start()
+
+    try:
         yield send
+    finally:
+        ended.set()
+        reader.close()
 
 
 def _connected(to: str) -> socket.socket:

@@ -210,7 +210,7 @@ def _live(a: argparse.Namespace) -> None:
     keep["say"] = warn
     keep |= {} if a.backlog is None else {"backlog": a.backlog}
     if a.out is not None:
-        look_into(a.out, keep["if_exists"])  # before anyone clicks
+        look_into(a.out, keep["if_exists"], resumable=False)  # before anyone clicks
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:

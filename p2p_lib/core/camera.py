@@ -40,21 +40,24 @@ class Camera:
             raise BadInput("camera", f"fx, fy, cx, cy = {values}", "finite numbers, focal lengths above 0 (pixels)")
         if self.width < 1 or self.height < 1:
             raise BadInput("camera", f"{self.width}x{self.height}", "an image size of at least 1x1 pixels")
+        _check_pixels("camera", self.fx, self.width)
         for name, value in zip(("fx", "fy", "cx", "cy"), values):
             object.__setattr__(self, name, float(value))
 
     @classmethod
     def from_K(cls, K: np.ndarray, width: int, height: int, name: str = "K") -> Camera:
-        """From a 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; ``name`` is what errors call it."""
+        """From a 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], or its nine numbers as ROS gives them.
+
+        ``name`` is what errors call it.
+        """
         K = np.asarray(K, float)
+        K = K.reshape(3, 3) if K.shape == (9,) else K
         if K.shape != (3, 3):
             raise BadInput(name, f"shape {K.shape}", "a 3x3 camera matrix")
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K - pinhole).max() > 1e-6:
             raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
-        if K[0, 0] < _WIDEST * width:
-            fix = "Normalised ones times the width, the height below, are pixels."
-            raise BadInput(name, f"fx = {K[0, 0]:g} for {width} columns", "focal lengths in pixels", fix)
+        _check_pixels(name, K[0, 0], width)
         return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
 
     def resized(self, width: int, height: int) -> Camera:
@@ -91,3 +94,10 @@ class Camera:
     def inside(self, uv_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the image; NaN does not."""
         return in_image(uv_px, (self.height, self.width), margin_px)
+
+
+def _check_pixels(name: str, fx: float, width: int) -> None:
+    """Refuse a focal length as a share of the image's width; ``name`` is what the error calls the camera."""
+    if fx < _WIDEST * width:
+        fix = "Normalised ones times the width, the height below, are pixels."
+        raise BadInput(name, f"fx = {fx:g} for {width} columns", "focal lengths in pixels", fix)

@@ -55,6 +55,7 @@ class Objects(ABC, Generic[FollowedT]):
         self.camera = camera
         self.objects: dict[str, FollowedT] = {}
         self.refused: dict[str, BadInput] = {}
+        self._ignored: dict[str, str] = {}  # of corrections of the newest frame
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
         self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
@@ -217,9 +218,11 @@ class Objects(ABC, Generic[FollowedT]):
             self._cameras.popleft()
         prompts, self._prompts = {name: p for name, p in self._prompts.items() if name not in refused}, {}
         self.refused |= refused
+        self._ignored = {}
         for name, error in refused.items():
-            if name in self.segmenter.names:  # its estimates go on and cannot say so
-                doubt(f"correction of {name!r}", f"{error.name}: {error.got}", f"It is ignored. {error.fix}")
+            if name in self.segmenter.names:
+                what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
+                self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}")
         return given, prompts
 
     def explained(
@@ -247,7 +250,7 @@ class Objects(ABC, Generic[FollowedT]):
             few = f": a mask of {pixels} pixels does not start it" * (estimate.reason == NOT_SEEN)
             self._unstarted[name] = estimate.reason + (f": {said}" if said else few)
         reason = self._reason(estimate, frame, mask, given is not None)
-        parts = (reason, said * (estimate.T_cam_obj is not None), frame.remark)
+        parts = (reason, said * (estimate.T_cam_obj is not None), self._ignored.get(name, ""), frame.remark)
         return replace(estimate, reason="; ".join(filter(None, parts)))
 
     def _reason(self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, mask_given: bool) -> str:

@@ -81,7 +81,9 @@ def _prompt(given: Any, folder: Path | None) -> Prompt:
         mask = _of_runs(f"mask of {given['name']!r}", given["mask"])
     elif given.get("mask") is not None:
         if folder is None or not isinstance(given["mask"], str):
-            raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], "an image beside the prompts")
+            runs = 'run lengths {"size": [height, width], "counts": [...]}'
+            expected = runs if folder is None else f"an image beside the prompts, or {runs}"
+            raise BadInput(f"mask of {given['name']!r}", repr(given["mask"])[:60], expected)
         mask = read_image(folder / given["mask"], cv2.IMREAD_GRAYSCALE, "a mask image") > 0
     called = {"points_px": "points", "negative_px": "negative", "box_px": "box"}
     fields: dict[str, Any] = {field: given[key] for field, key in called.items() if given.get(key) is not None}

@@ -317,7 +317,7 @@ class RunWriter:
         replace_text(self._pose_files[name], "".join(lines))
 
 
-def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
+def look_into(out: Path, if_exists: IfExists, resumable: bool = True) -> dict[str, Any] | None:
     """What ``run.json`` says of the run that a folder holds, None where nothing would be lost.
 
     Raises :class:`BadInput` where the folder is not free: it holds anything else, or a run that is to stay.
@@ -330,7 +330,9 @@ def look_into(out: Path, if_exists: IfExists) -> dict[str, Any] | None:
             raise BadInput(str(out), got, "a new or empty folder, or that of a run", "Name another one.")
         return None
     if info["frames"] and if_exists == "refuse":
-        fix = f"Name another folder, replace it ({_ANEW}) or go on with it (--resume, in Python if_exists='resume')."
+        fix = f"Name another folder, or replace it ({_ANEW})."
+        if resumable:
+            fix = f"{fix[:-1]}, or go on with it (--resume, in Python if_exists='resume')."
         raise BadInput(str(out), _in_words(info), "a new or empty folder", fix)
     return info if info["frames"] else None
 

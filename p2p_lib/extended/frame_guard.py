@@ -48,11 +48,16 @@ class FrameGuard:
         self._time_s, self._stopped, self._warned = -np.inf, False, False  # of the frame before
         self._stale, self._slow = StaleFrames(), 0  # how many frames in a row came so slowly
         self._newest: Frame | None = None
+        self._counts_up = True
 
     def __call__(self, frame: Frame) -> Frame:
         """The frame to go on with."""
         if frame is self._newest:  # the last one again, which ends a stream
             return frame
+        if self._counts_up and self._newest is not None and frame.index <= self._newest.index:
+            got = f"not above that of the frame before ({self._newest.index})"
+            doubt(f"index of frame {frame.index}", got, "Count frames up: what is kept of earlier ones goes by it.")
+            self._counts_up = False
         remarks, changes = [self._time_remark(frame)], {}
         self._stale = self._stale.with_frame(frame)
         half, still = self._stale.for_long(frame.time_s)

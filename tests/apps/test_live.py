@@ -746,6 +746,8 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
             '{"name": "mug"}',
             '{"mug": [[320, 240]]}',
             '{"name": "mug", "point": [[320, 240]]}',
+            '{"name": "mug", "clicks": [[320, 240]]}',
+            '{"name": "mug", "mask": "mug.png"}',
             "[]",
             " ",
         ):
@@ -759,13 +761,15 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
         "line: got hello",
         "remove_object: got 'mug', expected one of no objects",
         "clicks on 'mug'",
-        '"points": [[x, y], ...]} or {"remove": "mug"}. Say where it is: points, negative or box.',
+        '"points": [[x, y], ...]} or {"remove": "mug"}. Say where it is: box, mask, negative, points.',
         "Did you mean points?",
+        "'clicks' is not known. Say where it is: box,",
+        "mask of 'mug': got 'mug.png', expected run lengths",
         'line: got {"mug": [[320, 240]]}, expected {"name"',
         "line: got []",
     ):
         assert part in said
-    assert len(errors) == 7
+    assert len(errors) == 9
 
 
 @pytest.mark.parametrize("kind", ["tcp", "udp"])
@@ -802,7 +806,12 @@ def test_a_reader_that_goes_away_ends_nothing(capsys):
             for _ in range(20):
                 send("x" * 10_000)
                 time.sleep(0.01)
-    assert len(said) == 1 and "tracking goes on" in said[0]
+            assert len(said) == 1 and "tracking goes on" in said[0]
+            another = server.accept()[0]
+            while len(said) < 2:
+                time.sleep(0.001)
+            send("again")
+            assert another.recv(100) == b"again\n" and said[1].endswith("takes lines again.")
 
 
 def test_a_camera_of_somebody_elses(folder, tmp_path, capsys, monkeypatch):

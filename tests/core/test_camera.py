@@ -12,7 +12,7 @@ from p2p_lib.core.errors import BadInput
 CAMERA = Camera(615.2, 613.9, 318.4, 243.1, 640, 480)
 cameras = st.builds(
     Camera,
-    fx=st.floats(50, 3000),
+    fx=st.floats(400, 3000),
     fy=st.floats(50, 3000),
     cx=st.floats(-100, 2000),
     cy=st.floats(-100, 2000),
@@ -24,6 +24,15 @@ cameras = st.builds(
 def test_a_focal_length_in_letters_is_refused():
     with pytest.raises(BadInput, match="expected finite numbers"):
         Camera("600", 600, 320, 240, 640, 480)
+
+
+def test_shares_of_the_width_are_no_pixels():
+    with pytest.raises(BadInput, match=r"camera: got fx = 0\.96 for 640 columns, expected focal lengths in pixels"):
+        Camera(0.96, 1.28, 0.5, 0.5, 640, 480)
+
+
+def test_nine_numbers_are_a_matrix_row_by_row():
+    assert Camera.from_K(CAMERA.K.ravel(), 640, 480) == CAMERA
 
 
 # --- projecting and back -----------------------------------------------------------------------
@@ -146,7 +155,7 @@ def K_with(at: tuple[int, int], value: float) -> np.ndarray:
     [
         (np.eye(2), r"shape \(2, 2\)"),
         (np.zeros((3, 4)), r"shape \(3, 4\)"),
-        (np.zeros(9), r"shape \(9,\)"),
+        (np.zeros(8), r"shape \(8,\)"),
         (K_with((0, 0), np.nan), "nan"),
         (K_with((1, 2), np.inf), "inf"),
         (K_with((0, 0), 0.0), "fx 0 cx"),

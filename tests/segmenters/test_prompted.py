@@ -483,3 +483,5 @@ def test_doubts_are_of_what_a_prompt_has_started_alone(monkeypatch):
     assert cutter.doubts == {"right": "odd"}
     cutter.segment(picture(2))
     assert cutter.doubts == {}
+    cutter.segment(picture(3), [Prompt("left", points_px=[[40, 35]])])
+    assert cutter.doubts == {"left": "odd"}, "far from what it was followed by: that is a start"

@@ -183,16 +183,15 @@ class Cutter:
         either = np.prod(high - low) + np.prod(last - first) - both
         return float(_PER_UNFILLED * max(_FILLED - both / either, 0))
 
-    def correct(self, was: np.ndarray) -> tuple[Box, np.ndarray]:
-        """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays.
-
-        Farther from every positive click than it is long, the mask is of something else: the clicks alone count then.
-        """
-        clicks, (rows, columns) = self.prompt.points_px, bounds(was)
-        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+    def leaves(self, was: np.ndarray) -> bool:
+        """Whether a mask (H, W) bool is farther from every positive click than it is long: it is of something else."""
+        clicks, ends = self.prompt.points_px, _ends(was)
         away = np.maximum(np.maximum(ends[0] - clicks, clicks - ends[1] + 1), 0)
-        if len(clicks) and np.linalg.norm(away, axis=1).min() > np.ptp(ends, 0).max():
-            return self.start()
+        return bool(len(clicks) and np.linalg.norm(away, axis=1).min() > np.ptp(ends, 0).max())
+
+    def correct(self, was: np.ndarray) -> tuple[Box, np.ndarray]:
+        """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays."""
+        clicks, ends = self.prompt.points_px, _ends(was)
         px = np.concatenate([ends, clicks, self.prompt.negative_px])
         fits = replace(self.config, side_px=2 * self.config.side_px)
         patch = Patch.of(self.frame, self._room(px.min(0), px.max(0)), self.camera, fits)
@@ -319,3 +318,9 @@ def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:
     slack = _TIGHT * np.ptp(box_px.reshape(2, 2), 0)
     left, top, right, bottom = box_px + np.concatenate([-slack, slack])
     return ((v >= top) & (v <= bottom))[:, None] & ((u >= left) & (u <= right))
+
+
+def _ends(mask: np.ndarray) -> np.ndarray:
+    """(2, 2) the corners, x and y, of the box around a mask (H, W) bool."""
+    rows, columns = bounds(mask)
+    return np.array([[columns.start, rows.start], [columns.stop, rows.stop]])

@@ -61,7 +61,8 @@ class BuiltinSegmenter:
     """The segmenter without learned weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
     refiner  may replace an object's mask in a frame, before it is labelled and learnt from
-    doubts   of objects that a prompt of the newest frame has started: what is doubtful about their masks
+    doubts   of objects that a prompt of the newest frame has started, or moved elsewhere: what is doubtful about their
+             masks
     """
 
     def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
@@ -71,6 +72,7 @@ class BuiltinSegmenter:
         self._previous: Frame | None = None
         self._frames = 0
         self.doubts: dict[str, str] = {}
+        self._begun: set[str] = set()  # whose masks prompts of the newest frame did not mend, but began
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -94,7 +96,7 @@ class BuiltinSegmenter:
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
-        new = cutters.keys() - self._targets.keys()
+        self._begun = set()
         corrected = [
             name
             for name, cutter in cutters.items()
@@ -113,7 +115,7 @@ class BuiltinSegmenter:
         claims |= self._refined(frame, prompt_of, claims, hints, corrected)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
-        self.doubts = self._doubts(labels, cutters, new)
+        self.doubts = self._doubts(labels, cutters)
         self._previous = frame
         return labels
 
@@ -179,7 +181,10 @@ class BuiltinSegmenter:
         _mark(was, had[1])
         if not cutter.prompt.starts:
             return Target(), cutter.correct(was) if was.any() else None
-        box, x = cutter.correct(was) if was.any() and cutter.prompt.box_px is None else cutter.start()
+        mends = was.any() and not cutter.leaves(was)
+        if not mends:
+            self._begun.add(cutter.prompt.name)
+        box, x = cutter.correct(was) if mends and cutter.prompt.box_px is None else cutter.start()
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
@@ -269,14 +274,14 @@ class BuiltinSegmenter:
             self._targets[name] = target.with_seen(frame, seen, view.focal_px, cfg)
         return labels
 
-    def _doubts(self, labels: np.ndarray, cutters: Mapping[str, Cutter], new: Collection[str]) -> dict[str, str]:
-        """Warn if a prompt has selected nothing, or if one that started a ``new`` object may be of something else."""
+    def _doubts(self, labels: np.ndarray, cutters: Mapping[str, Cutter]) -> dict[str, str]:
+        """Warn if a prompt has selected nothing, or if one that began a mask may have selected something else."""
         masks = {name: labels == label for label, name in enumerate(self._targets, 1)}
         said = {}
         for name, cutter in cutters.items():
             others = {other: mask for other, mask in masks.items() if other != name}
-            said[name] = doubt_prompt(cutter, masks[name], others, name in new)
-        return {name: said[name] for name in new if said[name]}
+            said[name] = doubt_prompt(cutter, masks[name], others, name in self._begun)
+        return {name: said[name] for name in self._begun if said[name]}
 
 
 def _cutter(view: View, prompt: Prompt, prompt_of: Mapping[str, Prompt]) -> Cutter:

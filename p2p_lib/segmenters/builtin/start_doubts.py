@@ -63,7 +63,8 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
 
 def doubt_nothing(cutter: Cutter, instead: str = "") -> str:
     """Warn that a prompt has selected nothing; ``instead`` says what its object has for a mask."""
-    fix = "Click near its centre and on parts of other colours, or draw a box."
+    boxed = cutter.prompt.box_px is not None
+    fix = "Click near its centre and on parts of other colours" + (", too." if boxed else ", or draw a box.")
     return doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip())
 
 
