@@ -34,6 +34,7 @@ from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.evaluation.known_size import in_masks_m
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
@@ -465,12 +466,12 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     for name, obj in run.objects.items():
         without = zip(obj.status[~obj.has_pose], obj.reason[~obj.has_pose])
         why = Counter(_OTHER_MAP if s in WITH_POSE else status_text(s, r).partition(" since ")[0] for s, r in without)
-        otherwise = "otherwise mostly" if obj.has_pose.any() else "mostly"
-        most = f"; {otherwise} {why.most_common(1)[0][0]}" if why else ""
+        others = f"in the other {sum(why.values())} " if obj.has_pose.any() else ""
+        most = f"; {others}{'mostly ' if len(why) > 1 else ''}{why.most_common(1)[0][0]}" if why else ""
         doubted = int(obj.doubted.sum())
         doubts = f", {doubted} of them doubted (confidence at most {DOUBTED:g})" if doubted else ""
-        lengths_m = masks[name].size_m if name in masks else np.zeros(0)
-        long = f"; {100 * np.nanmedian(lengths_m):.3g} cm long by its masks" if np.isfinite(lengths_m).any() else ""
+        length_m = in_masks_m(masks[name].size_m) if name in masks else np.nan
+        long = f"; {100 * length_m:.3g} cm long by its masks" if np.isfinite(length_m) else ""
         lines.append(f"{name}: a pose in {int(obj.has_pose.sum())} of {count} frames{doubts}{most}{long}")
     return tuple(lines)
 

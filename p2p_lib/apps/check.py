@@ -32,7 +32,7 @@ from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera, sees
 from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size, uncounted
-from p2p_lib.datasets.image_sequence import paired_images, read_K
+from p2p_lib.datasets.image_sequence import INTRINSICS, paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
@@ -238,7 +238,8 @@ def _files(folder: Path) -> list[Finding]:
     first("depth", images.DEPTH, images.read_raw_depth)
     if not wrong:
         look("depth/", "", lambda: paired_images(folder))
-    look("cam_K.txt", "", lambda: Camera.from_K(read_K(folder)[0], 1, 1, "cam_K.txt"))
+    camera = next((name for name in ("cam_K.txt", *INTRINSICS) if (folder / name).is_file()), "cam_K.txt")
+    look(camera, "", lambda: Camera.from_K(read_K(folder)[0], 1, 1, camera))
     for path in (path for path in (folder / "times.txt", folder / "depth_scale.txt") if path.exists()):
         look(path.name, "It is optional: correct it or remove it.", partial(images.read_numbers, path, "numbers"))
     return wrong
@@ -447,7 +448,9 @@ def _rim(name: str, seen: list[tuple[Frame, np.ndarray]], config: Config) -> Fin
     large, deep_m = mask.mean(), far_m - near_m  # without its outermost pixels
     if large > LARGE_SHARE or deep_m > DEEP_SHARE * away_m:
         text = f"it covers {100 * large:.0f} % of the image, over {deep_m:.2f} m of depth; {text}"
-        fix = "If this is a table or a wall, click near the centre of the object, or draw the mask tighter."
+        fix = (
+            "If a table or a wall is in it, click near the object's centre, or draw the mask tighter; else it is fine."
+        )
         return Finding(f"{name}: mask", Level.LOOK, text, fix)
     return Finding(f"{name}: mask", Level.OK, text)
 

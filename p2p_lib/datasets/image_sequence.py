@@ -20,13 +20,18 @@ from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import ObjectTruth
 
 #: What to do without a camera matrix.
-WRITE_K = "Write fx 0 cx / 0 fy cy / 0 0 1 into it, in pixels at the size of the images."
+WRITE_K = (
+    "Write fx 0 cx / 0 fy cy / 0 0 1 into cam_K.txt, in pixels at the size of the images, as the camera's driver gives "
+    "them; without it camera_intrinsic.json of Open3D's recorder is read."
+)
 #: What Open3D's recorders call theirs.
 INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
 
 
 class _Intrinsic(BaseModel):
     intrinsic_matrix: Annotated[list[float], Field(min_length=9, max_length=9)]
+    width: int | None = None
+    height: int | None = None
 
 
 def paired_images(folder: Path, colour: str = "rgb") -> tuple[tuple[Path, ...], tuple[Path, ...]]:
@@ -172,7 +177,25 @@ class ImageSequence:
 def image_files(folder: Path) -> ImageSequence:
     """The sequence in a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
     rgb, depth = paired_images(folder)
-    return ImageSequence(folder, rgb, depth, camera_for(rgb, *read_K(folder)), images.frame_times(folder, rgb))
+    return ImageSequence(folder, rgb, depth, camera_of(folder, rgb), images.frame_times(folder, rgb))
+
+
+def camera_of(folder: Path, rgb: Sequence[Path]) -> Camera:
+    """The camera of a folder's images, for whose size its file may be."""
+    K, name = read_K(folder)
+    camera = camera_for(rgb, K, name)
+    lens = _recorded(folder)
+    if lens is not None and name == str(lens[0]) and lens[1].width and lens[1].height:
+        got, expected = (f"{of.width}x{of.height}" for of in (lens[1], camera))
+        if got != expected:
+            raise BadInput(name, f"the camera of images of {got}", f"that of these, {expected}", WRITE_K)
+    return camera
+
+
+def _recorded(folder: Path) -> tuple[Path, _Intrinsic] | None:
+    """The JSON of Open3D's recorders and what it holds, where there is one."""
+    path = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
+    return None if path is None else (path, read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it"))
 
 
 def read_K(folder: Path) -> tuple[np.ndarray, str]:
@@ -181,10 +204,9 @@ def read_K(folder: Path) -> tuple[np.ndarray, str]:
     That is ``cam_K.txt``, in three lines or in one, or where there is none the JSON that Open3D's recorders write.
     """
     path, expected = folder / "cam_K.txt", "a 3x3 camera matrix in pixels"
-    recorded = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
-    if recorded is not None and not path.is_file():
-        lens = read_json(recorded, _Intrinsic, "a pinhole camera as Open3D writes it")
-        return np.array(lens.intrinsic_matrix).reshape(3, 3).T, str(recorded)  # it is written column by column
+    if not path.is_file() and (recorded := _recorded(folder)) is not None:
+        name, lens = recorded
+        return np.array(lens.intrinsic_matrix).reshape(3, 3).T, str(name)  # it is written column by column
     try:
         K = images.read_numbers(path, expected)
     except MissingData as error:

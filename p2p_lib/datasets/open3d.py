@@ -10,7 +10,7 @@ from pathlib import Path
 
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import INTRINSICS, ImageSequence, camera_for, paired_images, read_K
+from p2p_lib.datasets.image_sequence import INTRINSICS, ImageSequence, camera_of, paired_images
 
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
@@ -19,5 +19,5 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     if not any((folder / name).is_file() for name in (*INTRINSICS, "cam_K.txt")):
         fix = "Open3D's recorder writes it beside color/. If it is of another layout, name that with --format."
         raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}, as Open3D's layout (color/) has", fix)
-    files = ImageSequence(folder, rgb, depth, camera_for(rgb, *read_K(folder)), images.frame_times(folder, rgb))
+    files = ImageSequence(folder, rgb, depth, camera_of(folder, rgb), images.frame_times(folder, rgb))
     return files.without_truth(masks)

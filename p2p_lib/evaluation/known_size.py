@@ -58,17 +58,13 @@ class Lengths:
         """That it is measured as long as it is known to be, in words; "" where it is not, or not measured."""
         if self.doubt or not self._measured:
             return ""
-        least_m, most_m = self._range_m(list(self._measured)[-1])
+        least_m, most_m = _fitting_m(*list(self._measured.items())[-1])
         given = f"{100 * self.known_m:g} cm given"
         return f"measured {self._found}, {given}: fits, as {100 * least_m:.0f} to {100 * most_m:.0f} cm would"
 
-    def _range_m(self, what: str) -> tuple[float, float]:
-        across = _ACROSS if what == _MASKS else 1.0
-        return SHORTER * self.known_m, LONGER * across * self.known_m + SLACK_M
-
     def _fits(self, what: str, m: float) -> bool:
-        least_m, most_m = self._range_m(what)
-        return least_m <= m <= most_m
+        least_m, most_m = _fitting_m(what, m)
+        return least_m <= self.known_m <= most_m
 
     @property
     def _measured(self) -> dict[str, float]:
@@ -80,12 +76,22 @@ class Lengths:
         return " and ".join(f"{100 * m:.1f} cm {what}" for what, m in self._measured.items())
 
 
+def _fitting_m(what: str, m: float) -> tuple[float, float]:
+    """Between which lengths, m, something is that was measured ``m`` long."""
+    return (m - SLACK_M) / (LONGER * (_ACROSS if what == _MASKS else 1.0)), m / SHORTER
+
+
+def in_masks_m(sizes_m: np.ndarray) -> float:
+    """The length, m, of an object whose masks are so long (n,), where they show the most of it; NaN: none measured."""
+    measured = sizes_m[np.isfinite(sizes_m)]
+    return float(np.quantile(measured, _OFTEN)) if len(measured) else float("nan")
+
+
 def lengths(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, Lengths]:
     """Objects of known length, m, as a run's folder has measured them."""
     masks, found = load_masks(folder) if known_m else {}, {}
     for name, length_m in known_m.items():
-        sizes = masks[name].size_m[np.isfinite(masks[name].size_m)] if name in masks else np.zeros(0)
-        mask_m = float(np.quantile(sizes, _OFTEN)) if len(sizes) else float("nan")
+        mask_m = in_masks_m(masks[name].size_m) if name in masks else float("nan")
         found[name] = Lengths(length_m, mask_m, mesh_length_m(Path(folder) / "meshes" / f"{name}.ply"))
     return found
 

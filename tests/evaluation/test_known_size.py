@@ -42,7 +42,7 @@ def test_a_run_is_measured_where_its_masks_show_the_most(tmp_path, monkeypatch):
     found = known_size.lengths(tmp_path, {"box": 0.1, "other": 0.1})
     assert found["box"].mask_m == pytest.approx(0.1) and np.isnan(found["other"].mask_m)
     assert known_size.that_fit(found | {"long": Lengths(0.1, 0.3)}) == [
-        "box: measured 10.0 cm in its masks, 10 cm given: fits, as 7 to 17 cm would"
+        "box: measured 10.0 cm in its masks, 10 cm given: fits, as 6 to 14 cm would"
     ]
 
 

@@ -1014,7 +1014,9 @@ def test_a_correction_without_depth_is_doubted_and_changes_nothing():
             method.correct("left", clicks=at)
             with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is ignored"):
                 estimates = method.step(frame)
-            assert "has no depth in frame 3. It is ignored" in estimates["left"].reason, "whoever reads that alone knows"
+            assert "has no depth in frame 3. It is ignored" in estimates["left"].reason, (
+                "whoever reads that alone knows"
+            )
             estimates["left"] = replace(estimates["left"], reason=expected["left"].reason)
         else:
             estimates = method.step(frame)
