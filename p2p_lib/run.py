@@ -443,7 +443,7 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
         evaluation, not_scored = None, str(error)
     if not any(obj.has_truth.any() for obj in done.objects.values()):
         of = f" of {', '.join(done.objects)}, only of {', '.join(job.sequence.truth)}" if job.sequence.truth else ""
-        not_scored = f"the sequence has no truth{of or ' (looked for in annotated_poses/ of a folder)'}"
+        not_scored = f"the sequence has no truth{of or sequences.no_truth_said(job.sequence)}"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
     advice = "" if interrupted else _advice(done, job)
     look_at = [f"{name}: {text}" for name, of in (done.info.get("look_at") or {}).items() for text in of]

@@ -13,15 +13,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 
 import p2p_lib
 from p2p_lib import Point2Pose, preset
 from p2p_lib.apps import cli, command_line
+from p2p_lib.benchmark.jobs import jobs_of
+from p2p_lib.benchmark.plan import Plan
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.images import save_png
-from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.datasets.models import find_models
+from p2p_lib.datasets.sequence import no_truth_said, open_sequence
 from studies.runner import list_notebooks
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -174,7 +178,7 @@ def test_the_example_tracker_tracks():
 def test_the_example_loader_loads(tmp_path, monkeypatch):
     """The loader of CONTRIBUTING.md, taken from there, by ``--format``'s name for it."""
     source = re.search(
-        r"```python\n(import numpy as np\n\nfrom p2p_lib import Camera.*?)```", read("CONTRIBUTING.md"), re.DOTALL
+        r"```python\n(from dataclasses import replace\n\nimport numpy.*?)```", read("CONTRIBUTING.md"), re.DOTALL
     )
     (tmp_path / "documented_loader.py").write_text(source[1])
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -190,6 +194,22 @@ def test_the_example_loader_loads(tmp_path, monkeypatch):
     sequence = open_sequence(tmp_path / "mine", format="documented_loader:load")
     assert np.allclose(sequence.frame(0).depth_m, 0.6) and sequence.camera.fx == 500
     np.testing.assert_array_equal(sequence.masks(0)["mug"], mask)
+    assert sequence.truth == {} and no_truth_said(sequence) == " (its loader gives none, see CONTRIBUTING.md)"
+
+    np.save(tmp_path / "mine/poses.npy", np.eye(4)[None])
+    trimesh.creation.box().export(tmp_path / "mine/mug.ply")
+    sequence = open_sequence(tmp_path / "mine", format="documented_loader:load")
+    assert sequence.truth["mug"].T_cam_model.shape == (1, 4, 4)
+    assert find_models(sequence) == {"mug": tmp_path / "mine/mug.ply"}
+
+
+def test_the_example_plan_is_one():
+    """The plan of docs/results.md, as it stands."""
+    source = re.search(r"```toml\n(title.*?)```", read("docs/results.md"), re.DOTALL)[1]
+    plan = Plan.model_validate({"name": "mine", **tomllib.loads(source)})
+    assert plan.full.sequence[1].format == "mine:load" and plan.methods("quick") == plan.method[:1]
+    jobs = jobs_of(plan, "full")
+    assert {job.sequence.name for job in jobs if job.key} == {"synthetic/crossing"}, "the other is the reader's own"
 
 
 def test_the_example_camera_is_played_live(tmp_path, monkeypatch, capsys):

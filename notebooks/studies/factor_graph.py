@@ -204,7 +204,7 @@ _LINES = {
     "without observations": (style.METHODS[4], "-."),
     "without registration": (style.METHODS[3], ":"),
     "all three, squares": (style.METHODS[5], "--"),
-    "the paper's noise": (style.METHODS[2], "-."),
+    "constant noise": (style.METHODS[2], "-."),
 }
 #: That of the graph as it is, whatever it is compared with.
 _GRAPH = (style.METHODS[0], "-")

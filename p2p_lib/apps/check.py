@@ -35,7 +35,7 @@ from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, lik
 from p2p_lib.datasets.image_sequence import INTRINSICS, paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
-from p2p_lib.datasets.sequence import Sequence, open_sequence, recognise
+from p2p_lib.datasets.sequence import Sequence, no_truth_said, open_sequence, recognise
 from p2p_lib.evaluation.known_size import Lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.evaluation.suspicions import doubt_growth
@@ -306,7 +306,7 @@ def _truth(sequence: Sequence) -> Finding:
         shown = [px is None or px.get(name, 0) >= MIN_VISIBLE_PX for px in masks_px]
         count, said = int((posed & of.labelled & shown).sum()), f"{name} in {posed.sum()} images"
         seen.append(said if count == posed.sum() else f"{said}, in sight in {count} of them")
-    none = "none (looked for in annotated_poses/ of a folder), so that a run is not scored"
+    none = f"none{no_truth_said(sequence)}, so that a run is not scored"
     return Finding("truth", Level.OK, "; ".join(seen) or none)
 
 

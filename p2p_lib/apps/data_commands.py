@@ -228,7 +228,7 @@ def _config(a: argparse.Namespace) -> None:
         print(f"{row['key']} = {value}\n    {row['meaning']}" + f" [{row['source']}]" * (not a.diff))
         for name, does in MECHANISMS.items() if row["key"] == "method.mechanisms" else ():
             print(f"        {name}{'' if name in on else ' (left out)'}: {does}")
-    whose = "paper (its text), release (the authors' configuration) or ours"
+    whose = "paper (its text; none, false and 0 of what it does without), release (the authors' configuration) or ours"
     print(f"In brackets, whose value it is: {whose}. Change one with --set KEY=VALUE.")
 
 

@@ -18,6 +18,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, prompts_file, prompts_places, uses_clicks
+from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError, did_you_mean
 from p2p_lib.core.files import read_toml
 from p2p_lib.core.options import RunOptions
@@ -95,6 +96,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     measures: list[Literal["poses", "tracks"]] = ["poses", "tracks"] if plan.tracks and scope.tracks else ["poses"]
     methods = plan.methods(profile)
     lacking = {method.name: _lacking(method) for method in methods}
+    configs = {method.name: _config(plan, method) for method in methods}
     known: dict[tuple, str] = {}  # of this call alone: files may change until the next
     jobs = []
     for planned in scope.planned:
@@ -104,7 +106,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
                     for seed in scope.seeds:
                         reason = missing or lacking[method.name]
                         job = Job(method, sequence, seed, measure, plan.chamfer, plan.min_mask_px, reason=reason)
-                        jobs.append(job if reason else _keyed(job, known))
+                        jobs.append(job if reason else _keyed(job, configs[method.name], known))
     return jobs
 
 
@@ -120,7 +122,7 @@ def open_planned(job: Job) -> Sequence:
         rendered: Any = open_sequence(folder, "ycbmultitrack", masks=masks)  # of files
         sequence: Sequence = replace(rendered, name=planned.name, scene_seed=job.sequence_seed)
     else:
-        sequence = open_sequence(planned.name, masks=masks)
+        sequence = open_sequence(planned.name, planned.format or None, masks=masks)
     if (fault := planned.fault) is not None:
         severity = 1.0 if fault.severity is None else fault.severity
         start, stop = planned.during
@@ -134,16 +136,24 @@ def library_version() -> str:
     return _sha("\n".join([code_digest(), *(f"{name} {version(name)}" for name in _NUMERICS)]).encode())[:12]
 
 
-def _keyed(job: Job, known: dict[tuple, str]) -> Job:
+def _config(plan: Plan, method: Method) -> Config:
+    """The parameters of a method; :class:`BadInput` names the plan and the method whose preset or setting is wrong."""
+    try:
+        return preset(method.preset).with_values(method.settings)
+    except BadInput as error:
+        name = f"plan {plan.name}, method {method.name!r}: {error.name}"
+        raise BadInput(name, error.got, error.expected, error.fix) from None
+
+
+def _keyed(job: Job, config: Config, known: dict[tuple, str]) -> Job:
     """The job with its key, or with the reason why it cannot run."""
     method, planned = job.method, job.sequence
-    config = RunOptions(preset=method.preset, settings=method.settings, seed=job.seed).config()
     try:
         job.options()
         decides = {
             "library": library_version(),
             "measure": job.measure,
-            "config": config.as_dict(),
+            "config": config.with_values({"seed": job.seed}).as_dict(),
             "method": method.model_dump(include={"tracker", "detector", "masks", "scale", "count"}),
             "sequence": _fingerprint(job, known),
             "cut": [planned.start, planned.stop, planned.objects],
@@ -235,7 +245,7 @@ def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
         from p2p_lib.synthetic.generate import generator_version
 
         return [planned.name, job.sequence_seed, generator_version(), _synthetic(planned, method)[1]]
-    key = (planned.name, method.masks, tuple(planned.models.items()))
+    key = (planned.name, planned.format, method.masks, tuple(planned.models.items()))
     if key not in known:
         known[key] = _files_hash(job)
     return known[key]
@@ -254,6 +264,7 @@ def _files_hash(job: Job) -> str:
     models = sorted((find_models(sequence) | job.models).items())
     parts += [(name, path.read_bytes() if path.is_file() else b"") for name, path in models]
     parts += [] if sequence.path is None else [("files", _listing(sequence.path))]
+    parts += [("format", job.sequence.format.encode())] if job.sequence.format else []
     return _sha(b"".join(name.encode() + content for name, content in parts))
 
 

@@ -95,6 +95,7 @@ class PlannedSequence(Strict):
     """One sequence to run on.
 
     name       as ``p2p run`` takes it; ``DATASET/*`` stands for every sequence of a dataset that is present
+    format     its layout, as ``--format`` takes it, "": recognised; a synthetic one has its own
     objects    only these (default: all)
     seed       of a synthetic sequence; None: that of the run
     synthetic  parameters of a synthetic sequence; ``models = "DATASET"`` stands for that dataset's folder
@@ -104,6 +105,7 @@ class PlannedSequence(Strict):
     """
 
     name: Text
+    format: str = ""
     objects: list[Text] = []
     start: Count = 0
     stop: Count | None = None
@@ -114,6 +116,12 @@ class PlannedSequence(Strict):
     columns: dict[str, str] = {}
     fault: PlannedFault | None = None
     fault_frames: list[Count] = Field(default=[30, 60], min_length=2, max_length=2)
+
+    @model_validator(mode="after")
+    def _is_of_files(self) -> PlannedSequence:
+        if self.format and self.name.startswith(SYNTHETIC):
+            raise ValueError(f"format = {self.format!r}: {self.name} is rendered and has its own")
+        return self
 
     @property
     def during(self) -> list[int | None]:
@@ -162,6 +170,7 @@ class Plan(Strict):
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
     min_mask_px  frames in which less of an object's mask is to be seen are not scored: often the first of a return
+    quick    a few frames of bundled data, None where it has none
     """
 
     name: Annotated[str, AfterValidator(lambda name: file_name("name", name))]
@@ -174,7 +183,7 @@ class Plan(Strict):
     tracks: bool = False
     min_mask_px: Count = MIN_VISIBLE_PX
     method: Annotated[list[Method], Field(min_length=1)]
-    quick: Scope
+    quick: Scope | None = None
     full: Scope
 
     @model_validator(mode="after")
@@ -182,7 +191,7 @@ class Plan(Strict):
         names = [method.name for method in self.method]
         if len(set(names)) < len(names):
             raise ValueError("two methods have one name")
-        if unknown := {*self.quick.methods, *self.full.methods} - set(names):
+        if unknown := {*(self.quick.methods if self.quick else ()), *self.full.methods} - set(names):
             raise ValueError(f"methods: no method is called {unknown.pop()!r}")
         if unknown := {method.against for method in self.method} - {*names, ""}:
             raise ValueError(f"against: no method is called {unknown.pop()!r}")
@@ -200,7 +209,10 @@ class Plan(Strict):
         """``quick`` or ``full``."""
         if profile not in PROFILES:
             raise BadInput("profile", repr(profile), "one of " + ", ".join(PROFILES))
-        return getattr(self, profile)
+        if (scope := getattr(self, profile)) is None:
+            fix = f"Run it in full, or give it a table [{profile}]."
+            raise BadInput(f"plan {self.name}", f"the profile {profile}", "one that the plan has", fix)
+        return scope
 
     def methods(self, profile: str) -> list[Method]:
         """The methods of a scope."""
@@ -224,7 +236,7 @@ def read_plan(plan: str | Path) -> Plan:
     if not path.exists():
         fix = "Give a TOML file, or one of " + ", ".join(plan_names()) + "."
         raise MissingData(str(plan), "no such plan", fix)
-    expected = "a plan (see p2p_lib/benchmark/plan.py)"
+    expected = "a plan (see docs/results.md, section Plans)"
     content = read_toml(path, expected)
     try:
         return Plan.model_validate({"name": path.stem, **content})
@@ -232,7 +244,8 @@ def read_plan(plan: str | Path) -> Plan:
         first = error.errors()[0]
         if first["type"] != "extra_forbidden":
             raise BadInput(f"plan {path.name}", first_fault(error), expected) from None
-        word, known = str(first["loc"][-1]), {key for part in Strict.__subclasses__() for key in part.model_fields}
+        parts = (Plan, Scope, PlannedSequence, PlannedFault, Method)
+        word, known = str(first["loc"][-1]), {key for part in parts for key in part.model_fields}
         got = f"{'.'.join(map(str, first['loc']))}, a key unknown there"
         raise BadInput(f"plan {path.name}", got, expected, did_you_mean(word, known)) from None
 

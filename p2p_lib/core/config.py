@@ -6,7 +6,7 @@ shows how they differ. Presets choose parameters, never backends: the tracker, t
 source of masks are chosen by name elsewhere.
 
 Each field's metadata says its symbol or meaning, its unit, and whose value it is:
-``paper`` (its text), ``release`` (the authors' released configuration) or ``ours``.
+``paper`` (its text, or what it does without), ``release`` (the authors' released configuration) or ``ours``.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ class MethodConfig(_Checked):
     )
     noise: str = _p(
         "sensor",
-        "Points have the noise of a depth sensor at their range, or one constant noise each in registration and graph.",
+        "Points have the noise of a depth sensor at their range, or one constant noise each in registration and graph;"
+        " the paper gives points none, and its Sigma_reg may vary.",
         choices=("constant", "sensor"),
     )
     surface: bool = _p(True, "Each object's surface is reconstructed.", "", "paper")
@@ -214,7 +215,7 @@ class KeypointMapConfig(_Checked):
         10.0, "A larger turn since the nearest keyframe asks for a new one.", "deg", "paper", low=0
     )
     keyframe_min_points: int = _p(25, "Fewer visible points ask for a keyframe.", "points", "paper", low=0)
-    cooldown: int = _p(5, "Keyframes asked for by too few points are so many frames apart.", "frames", low=0)
+    cooldown: int = _p(5, "Keyframes asked for by too few points are so many frames apart; 0: any.", "frames", low=0)
     streak: int = _p(3, "A point is promoted after N_streak verified frames in a row.", "frames", "paper", low=1)
     max_uncertainty: float = _p(0.3, "A more uncertain track verifies nothing.", "", "paper", low=0, high=1)
     max_scatter_m: float = _p(0.008, "A point is promoted below this median absolute deviation.", "m", "paper", low=0)
@@ -282,7 +283,11 @@ class RefinementConfig(_Checked):
     iterations: int = _p(8, "Levenberg-Marquardt makes at most L steps.", "", "release", low=1)
     max_points: int = _p(700, "At most so many depth points are used.", "points", low=10)
     huber_m: float = _p(0.005, "This is the Huber threshold of the surface residual.", "m", low=1e-5)
-    min_eigenvalue: float = _p(0.0005, "Directions with a smaller eigenvalue are not determined by the shape.", low=0)
+    min_eigenvalue: float = _p(
+        0.0005,
+        "Directions with a smaller eigenvalue are not determined by the shape; residuals = surface moves in all.",
+        low=0,
+    )
 
 
 @dataclass(frozen=True)
@@ -390,7 +395,7 @@ def parameters(config: Config, only: str | None = None) -> list[dict[str, Any]]:
     ]
     for row in rows:
         if _PRESETS[config.preset].get(row["key"]) == row["value"]:
-            row["source"] = "paper" if row["key"] in _TEXT else "release"
+            row["source"] = "paper" if row["key"] in _TEXT else "release" if row["key"] in _RELEASE else "ours"
     if not rows:
         raise _unknown("configuration key", f"{stage}.{key}")
     return rows
@@ -403,7 +408,6 @@ _FIELDS = {f"{stage}.{f.name}": f for stage in _STAGES for f in fields(getattr(C
 _TEXT: dict[str, Any] = {
     "method.object_frame": "camera",
     "method.mechanisms": "none",
-    "method.noise": "constant",
     "keypoint_map.cooldown": 0,
     "keypoint_map.max_points": 0,
     "selection.rule": "surface",
@@ -427,7 +431,9 @@ _RELEASE: dict[str, Any] = {
     "factor_graph.bearing_sigma_rad": 0.01,
     "factor_graph.iterations": 20,
 }
-_PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _TEXT | _RELEASE}
+#: Where neither says it: our reading.
+_READING: dict[str, Any] = {"method.noise": "constant"}
+_PRESETS: dict[str, dict[str, Any]] = {"default": {}, "paper": _TEXT | _RELEASE | _READING}
 
 
 def preset(name: str = "default", seed: int = 0) -> Config:

@@ -113,8 +113,11 @@ class Doubts:
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """``Did you mean NAME?``, of those known the nearest to a word, in capitals or not; empty where none is near."""
-    called = {name.lower(): name for name in known}
+    """``Did you mean NAME?``, of those known the nearest to a word, in capitals or not; empty where none is near.
+
+    The word itself is no proposal: it may be known, and out of place.
+    """
+    called = {name.lower(): name for name in known if name != word}
     near = get_close_matches(word.lower(), called, n=1)
     return f"Did you mean {prefix}{called[near[0]]}?" if near else ""
 

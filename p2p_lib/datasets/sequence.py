@@ -35,6 +35,9 @@ FORMATS: dict[str, tuple[str, ...]] = {
 #: Of these a folder shows no more than where its colour images are: layouts of others are tried before them.
 _PLAIN = ("open3d", "folder")
 
+#: Layouts that keep their truth in ``annotated_poses/``; a plain folder that has one is recognised as another of them.
+_ANNOTATED = ("ycbmultitrack", "ycbineoat", "folder")
+
 #: What a file is that may be given where a folder is meant.
 RECORDINGS = {
     ".bag": "a recording of ROS 1 or a RealSense",
@@ -175,6 +178,13 @@ def open_sequence(
             raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
         read.check_camera()
     return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale, scene_seed=seed)
+
+
+def no_truth_said(sequence: Sequence) -> str:
+    """Where the truth of a sequence that has none was looked for, in brackets; empty where its layout has no place."""
+    if sequence.format in _ANNOTATED:
+        return " (looked for in annotated_poses/ of a folder)"
+    return "" if sequence.format in FORMATS else " (its loader gives none, see CONTRIBUTING.md)"
 
 
 def _scene(name: str, seed: int | None) -> tuple[str, int]:

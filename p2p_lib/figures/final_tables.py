@@ -28,12 +28,14 @@ from p2p_lib.figures.numbers import AREA_HEADS, AREA_KEYS, METRICS, Numbers, is_
 from p2p_lib.figures.run_tables import by_fault, by_grid, by_pair, by_run
 from p2p_lib.figures.tables import Cell, Table, emboldened, number
 
+_QUICK = "quick profile: a few frames of bundled data, which show that it runs and are no result"
 _NOT_IN_PAPER = Cell(note="not in the paper")
 
 
 def paper_table(benchmark: Benchmark) -> Table:
-    """The table of a benchmark, arranged as its plan's ``kind`` says."""
-    return KINDS[benchmark.plan.kind](Numbers(benchmark))
+    """The table of a benchmark, arranged as its plan's ``kind`` says; the title of a quick one says what it is."""
+    table = KINDS[benchmark.plan.kind](Numbers(benchmark))
+    return replace(table, title=f"{table.title} ({_QUICK})") if benchmark.profile == "quick" else table
 
 
 def write_table(benchmark: Benchmark) -> str:

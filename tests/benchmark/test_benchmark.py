@@ -221,6 +221,36 @@ def test_what_has_no_truth_is_not_run_for_nothing(plan, slides, tmp_path):
     assert of_bare and all(not job.key and "nothing could be scored" in job.reason for job in of_bare)
 
 
+LOADER = """
+from dataclasses import replace
+from p2p_lib.datasets import ycbineoat
+
+def load(folder, masks):
+    return ycbineoat.load(folder / "inside", masks)
+
+def darker(folder, masks):
+    return replace(load(folder, masks), depth_scale=0.0009)
+"""
+
+
+def test_a_sequence_of_ones_own_layout_is_run_by_its_loader(plan, slides, tmp_path, monkeypatch):
+    (tmp_path / "mine_of_a_plan.py").write_text(LOADER)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    shutil.copytree(slides[0], tmp_path / "own/inside")
+    text = plan.read_text().replace(f'name = "{slides[0]}"', f'name = "{tmp_path}/own", format = "mine_of_a_plan:load"')
+    (tmp_path / "own.toml").write_text(text)
+    done = run_benchmark(tmp_path / "own.toml", tmp_path / "out", "quick", progress=False, jobs=1)
+    assert done.counts() == {"done": 2, "failed": 0, "not run": 0}
+    assert number(table(done), **EXACT, method="Ours", sequence=f"{tmp_path}/own", object="object") > 50
+    assert done.run("Ours").info["format"] == "mine_of_a_plan:load" and len(done.video("Ours")) == 6
+    (tmp_path / "own.toml").write_text(text.replace(":load", ":darker"))
+    keys = {job.key for job in jobs_of(read_plan(tmp_path / "own.toml"), "quick")}
+    assert len(keys) == 2 and not keys & {job.key for job, _ in done.results}
+    (tmp_path / "own.toml").write_text(text.replace(', format = "mine_of_a_plan:load"', ""))
+    reasons = {job.reason for job in jobs_of(read_plan(tmp_path / "own.toml"), "quick")}
+    assert all("Give a folder that is in it" in reason for reason in reasons), "of itself it is no recording"
+
+
 def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp_path):
     def kill_the_first() -> None:
         while not (found := [p for p in multiprocessing.active_children() if p.pid]):

@@ -1,5 +1,6 @@
 """The plans of the package: they fit the configuration, the paper's tables and the manifests."""
 
+import re
 import shutil
 import time
 import tomllib
@@ -246,6 +247,12 @@ SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
         ("[quick]", '[[method]]\nname = "Ours"\n[quick]', "two methods have one name"),
         ("seeds = [0]", 'seeds = [0]\nmethods = ["Theirs"]', "no method is called 'Theirs'"),
         ('title = "t"', "title = ", "unreadable TOML"),
+        (
+            'name = "Ours"',
+            'name = "Ours"\nformat = "bop"',
+            r"method\.0\.format, a key unknown there, .* section Plans\)$",
+        ),
+        ('name = "a" }', 'name = "synthetic/mug", format = "bop" }', r"format = 'bop': synthetic/mug is rendered"),
     ],
 )
 def test_a_plan_that_does_not_fit_names_the_key(tmp_path, old, new, message):
@@ -255,6 +262,31 @@ def test_a_plan_that_does_not_fit_names_the_key(tmp_path, old, new, message):
     (tmp_path / "small.toml").write_text(SMALL.replace(old, new))
     with pytest.raises(BadInput, match=message):
         read_plan(tmp_path / "small.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            'settings = { "registration.hypotheses" = 3 }',
+            r"configuration key: got 'registration\.hypotheses', expected a key",
+        ),
+        ('settings = { "tsdf.voxel_m" = "small" }', r"config tsdf\.voxel_m: got 'small' \(str\), expected a number"),
+        ('preset = "papr"', r"preset: got 'papr', expected one of default, paper"),
+    ],
+)
+def test_a_parameter_that_does_not_fit_names_plan_and_method(tmp_path, line, message):
+    (tmp_path / "small.toml").write_text(SMALL.replace('name = "Ours"', f'name = "Ours"\n{line}'))
+    with pytest.raises(BadInput, match=rf"^plan small, method 'Ours': {message}"):
+        jobs_of(read_plan(tmp_path / "small.toml"), "full")
+
+
+def test_a_plan_may_do_without_a_quick_profile_which_is_then_refused(tmp_path):
+    (tmp_path / "small.toml").write_text(re.sub(r"(?s)\[quick\].*(?=\[full\])", "", SMALL))
+    plan = read_plan(tmp_path / "small.toml")
+    assert [method.name for method in plan.methods("full")] == ["Ours"]
+    with pytest.raises(BadInput, match=r"^plan small: got the profile quick, .* Run it in full, or give it a table"):
+        jobs_of(plan, "quick")
 
 
 def test_a_plan_that_is_not_there_lists_those_that_are():

@@ -64,7 +64,6 @@ def test_presets_choose_parameters_never_backends(key, name):
 PAPER_TEXT = {
     "method.object_frame": "camera",
     "method.mechanisms": "none",
-    "method.noise": "constant",
     "method.surface": True,
     "method.graph": True,
     "keypoint_map.keyframe_angle_deg": 10.0,
@@ -138,6 +137,7 @@ def test_what_is_said_to_be_the_papers_or_the_releases_is(key):
         ("paper", "method.mechanisms", "paper"),
         ("paper", "tsdf.truncation_voxels", "release"),
         ("paper", "sampling.r_ideal_px", "ours"),
+        ("paper", "method.noise", "ours"),
         ("default", "tsdf.voxel_m", "ours"),
     ],
 )

@@ -69,6 +69,7 @@ def test_errors_cross_process_borders(error):
 @pytest.mark.parametrize(("word", "meant"), [("sed", "SEED"), ("Seeed", "SEED"), ("Bxo", "box"), ("zzz", None)])
 def test_what_is_meant_is_found_in_capitals_and_without(word, meant):
     assert did_you_mean(word, ["SEED", "box"], "of.") == (f"Did you mean of.{meant}?" if meant else "")
+    assert did_you_mean("box", ["SEED", "box"]) == "", "what came is no better a second time"
 
 
 def test_doubts_that_differ_in_numbers_are_one_but_not_those_of_other_names():

@@ -397,6 +397,7 @@ def test_a_few_frames_crown_nobody(tmp_path):
         quick = paper_table(replace(made, profile="quick"))
         assert not any(c.bold for row in quick.rows for c in row) and "rate (Hz)" not in quick.heads
         full = paper_table(replace(made, profile="full"))
+        assert "quick profile" in quick.title and "no result" in quick.title and full.title == made.plan.title
         assert any(c.bold for row in full.rows for c in row) or "rate (Hz)" in full.heads
 
 
