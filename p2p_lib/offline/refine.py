@@ -42,14 +42,12 @@ from p2p_lib.evaluation.suspicions import ON_SURFACE
 from p2p_lib.offline import OFFLINE_COMMENT
 from p2p_lib.offline.evidence import VideoEvidence, VideoPoses, gather
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.surface import SurfacePoses, fused
+from p2p_lib.offline.surface import SurfacePoses, finer_m, fused
 from p2p_lib.offline.surface_check import SurfaceCheck
 
 _PARTS = ".offline.partial"
 #: Views fused while refining and at the end.
 FUSED, FUSED_LAST = 80, 150
-#: A volume grows by blocks: it takes so many times the voxels that a coarser one of the same surface would say.
-_ROOM = 1.3
 #: Old and new poses are compared in one frame in so many, by the mean over so many of those.
 _JUDGED_EVERY, _JUDGED = 3, 7
 #: A causal pose that costs more than this times the limit was wrong in that frame, and is not kept.
@@ -132,9 +130,7 @@ def _part(made: Finished, name: str, config: Config, evidence: VideoEvidence, pa
     poses.ask_neighbours(check)
     columns, fits = _columns(obj, poses, evidence, check)
     last = evenly(np.flatnonzero(fits & evidence.shown), FUSED_LAST)
-    # Half the voxels are eight times as many: as fine as all of the object fits.
-    fine_m = voxel_m * max(0.5, np.cbrt(_ROOM * np.prod(volume.shape) / config.tsdf.max_voxels))
-    if len((mesh := fused(made, name, columns["T_cam_obj"], last, config, fine_m).mesh()).faces):
+    if len((mesh := fused(made, name, columns["T_cam_obj"], last, config, finer_m(volume)).mesh()).faces):
         save(mesh, parts / "meshes" / f"{name}.ply")
     bar.update(len(T))
     save_arrays(parts / f"{name}.npz", columns)

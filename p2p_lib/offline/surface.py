@@ -22,6 +22,8 @@ from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck, off_surface
 
 #: A point within this distance of its place by a pose is a keypoint of the pose, m.
 _NEAR_M = 0.02
+#: Finer volumes grow by other blocks, and take up to so many times the voxels that the coarser one says.
+_ROOM = 1.3
 #: A fit is as good as usual up to so many standard deviations above the median cost, and this.
 _SIGMAS, _SLACK = 3.0, 0.02
 
@@ -35,6 +37,11 @@ def fused(made: Finished, name: str, T: np.ndarray, rows: np.ndarray, config: Co
             use = mask & off_edges(frame.depth_m, STEP_M) & in_range(frame.depth_m, config.depth)
             volume.integrate(frame.depth_m, frame.rgb, use, made.sequence.camera, se3.orthonormalised(T[k]))
     return volume
+
+
+def finer_m(volume: TsdfVolume) -> float:
+    """Half a volume's voxels, m, or such that all of its surface fits: half as long they are eight times as many."""
+    return volume.voxel_m * max(0.5, float(np.cbrt(_ROOM * np.prod(volume.shape) / volume.config.max_voxels)))
 
 
 class SurfacePoses:

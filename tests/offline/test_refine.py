@@ -22,7 +22,7 @@ from p2p_lib.offline import adjustment, evidence, loops, surface
 from p2p_lib.offline import refine as offline
 from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
 from p2p_lib.offline.finished import Finished
-from p2p_lib.offline.surface import SurfacePoses, fused
+from p2p_lib.offline.surface import SurfacePoses, finer_m, fused
 from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -238,6 +238,21 @@ def test_wrong_poses_are_mended_and_the_lost_one_is_found(made, tracked, monkeyp
     assert np.nanmedian(deg) < 0.8 and np.nanmedian(mm) < 2
     info = json.loads((tracked / "offline/run.json").read_text())
     assert info["offline"] is True and "offline" not in json.loads((tracked / "run.json").read_text())
+
+
+def test_a_surface_is_as_fine_as_all_of_the_object_fits(made):
+    """What has no room for half the voxels was cut off at the volume's end."""
+    of, T, config = Finished(made.run, made.sequence), made.run.objects["can"].T_cam_obj, preset()
+    rows = np.flatnonzero(np.isfinite(T[:, 0, 0]))[::4]
+    coarse = fused(of, "can", T, rows, config, config.tsdf.voxel_m)
+    assert finer_m(coarse) == config.tsdf.voxel_m / 2
+    few = replace(config, tsdf=replace(config.tsdf, max_voxels=2 * int(np.prod(coarse.shape))))
+    coarse = fused(of, "can", T, rows, few, config.tsdf.voxel_m)
+    fine_m = finer_m(coarse)
+    assert config.tsdf.voxel_m / 2 < fine_m < config.tsdf.voxel_m
+    whole = fused(of, "can", T, rows, config, fine_m).mesh().extents
+    np.testing.assert_array_equal(fused(of, "can", T, rows, few, fine_m).mesh().extents, whole)
+    assert (fused(of, "can", T, rows, few, config.tsdf.voxel_m / 2).mesh().extents < 0.9 * whole).any()
 
 
 def test_poses_that_fill_the_masks_better_stay(made, tracked, monkeypatch):
