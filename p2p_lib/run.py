@@ -27,7 +27,7 @@ from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera
 from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size, uncounted
-from p2p_lib.datasets.exchange import as_run, export, read_poses
+from p2p_lib.datasets.exchange import as_run, export, pose_files, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.models import find_models, given_models
@@ -37,6 +37,7 @@ from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.known_size import in_masks_m
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
+from p2p_lib.evaluation.readings import doubt_reading
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
 from p2p_lib.extended.default import Point2Pose
@@ -160,6 +161,30 @@ def evaluate_tracker(
     return task.score(task.tracker(options.tracker, config), search)
 
 
+def import_poses(
+    poses: str | Path,
+    sequence: str | Path | sequences.Sequence,
+    models: Mapping[str, str | Path] | None = None,
+    align: str = "first",
+    min_visible_px: int = 300,
+    format: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
+) -> Run:
+    """Any method's poses (:mod:`p2p_lib.datasets.exchange`) over these frames, ready to be scored as a run of ours.
+
+    Warns where they would score far better in another convention (:mod:`p2p_lib.evaluation.readings`).
+    """
+    sequence = sequences.open_sequence(sequence, format)
+    known = find_models(sequence) | given_models(models or {}, sequence.objects)
+    frames = _frame_range(len(sequence), start, stop)
+    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses), frames=frames)
+    written = pose_files(poses, sequence)
+    quaternions = {name for name, file in written.items() if file.is_file() and file.suffix.lower() != ".csv"}
+    doubt_reading(run, quaternions, align, min_visible_px)
+    return run
+
+
 def evaluate_poses(
     poses: str | Path,
     sequence: str | Path | sequences.Sequence,
@@ -170,11 +195,8 @@ def evaluate_poses(
     start: int = 0,
     stop: int | None = None,
 ) -> Evaluation:
-    """Score any method's poses (:mod:`p2p_lib.datasets.exchange`) by the rules of a run of ours over these frames."""
-    sequence = sequences.open_sequence(sequence, format)
-    known = find_models(sequence) | given_models(models or {}, sequence.objects)
-    frames = _frame_range(len(sequence), start, stop)
-    run = as_run(read_poses(poses, sequence), sequence, known, path=Path(poses), frames=frames)
+    """Score any method's poses by the rules of a run of ours over these frames, see :func:`import_poses`."""
+    run = import_poses(poses, sequence, models, align, min_visible_px, format, start, stop)
     return evaluate(run, None, align, min_visible_px)
 
 

@@ -22,8 +22,6 @@ from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.plan import Plan, read_plan
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.tables import as_markdown
-from p2p_lib.datasets.exchange import as_run, read_poses
-from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
 from p2p_lib.evaluation.protocol import evaluate
@@ -31,6 +29,7 @@ from p2p_lib.figures import overlay, style
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.provenance import Saved, save_figure
 from p2p_lib.figures.scenes import Scene, side_by_side
+from p2p_lib.run import import_poses
 from studies import CLONE, SHIPPED, mesh_view
 from studies.final_figures import rate_figure, scene_of
 from studies.pipeline_diagram import pipeline_diagram
@@ -79,8 +78,8 @@ def plan_for(names: Collection[str]) -> Plan:
 def draw_all(runs: Benchmark, folder: Path, names: Collection[str], poses: Path | None = None) -> list[Saved]:
     """The figures of these names into ``folder`` from these runs, then the index.
 
-    poses  of a competitor on ``synthetic/occlusion``, in any form that ``p2p import`` takes; without, ours with and
-           without long memory stand in for the two
+    poses  of a competitor on ``synthetic/occlusion``, in any form that ``p2p eval --poses`` takes; without, ours
+           with and without long memory stand in for the two
     """
     drawn: dict[str, tuple[Callable[[Benchmark], np.ndarray], str]] = {
         "fig1_three_objects": (three_objects, "Three objects, each hidden by a hand in turn."),
@@ -88,8 +87,13 @@ def draw_all(runs: Benchmark, folder: Path, names: Collection[str], poses: Path 
         "fig3_synthetic": (airplane_and_can, "Two objects, one circling the other."),
         "fig5_return": (partial(return_beside, poses=poses), _RETURN if poses is None else _RIVAL),
     }
-    of_runs: dict[str, Any] = {"sources": [runs], "parameters": {"profile": runs.profile}, "to": folder}
-    saved = [save_figure(drawn[name][0](runs), name, drawn[name][1], **of_runs) for name in names if name in drawn]
+    drawn_from = {name: [runs] for name in drawn} | ({"fig5_return": [runs, poses]} if poses else {})
+    of_runs: dict[str, Any] = {"parameters": {"profile": runs.profile}, "to": folder}
+    saved = [
+        save_figure(drawn[name][0](runs), name, drawn[name][1], sources=drawn_from[name], **of_runs)
+        for name in names
+        if name in drawn
+    ]
     if "runtime" in names:
         times = next(path for path in (folder / "tables" / "runtime.csv", SHIPPED / "runtime.csv") if path.is_file())
         saved.append(save_figure(rate_figure(times), "runtime", "Processor time a frame.", sources=[times], to=folder))
@@ -131,7 +135,7 @@ def return_beside(runs: Benchmark, poses: Path | None = None) -> np.ndarray:
 
 def imported(poses: Path, video: Sequence) -> Run:
     """Any method's poses as a run that can be drawn and scored."""
-    run = as_run(read_poses(poses, video), video, find_models(video), poses, range(len(video)))
+    run = import_poses(poses, video)
     there = {name: obj for name, obj in run.objects.items() if obj.has_pose.any()}
     return Run(run.path, run.info, there, run.points, {})
 

@@ -40,7 +40,8 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
         "--poses",
         type=Path,
         metavar="PATH",
-        help="instead, to score another method: its BOP CSV or TUM file, or a folder of OBJECT.txt or of 4x4 files",
+        help="instead, to score another method, T_cam_obj with OpenCV's axes: its BOP CSV (mm), its TUM file or folder "
+        "of OBJECT.txt (time_s tx ty tz qx qy qz qw, m), or a folder of 4x4 files (m; images' names or frame numbers)",
     ),
     arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
     run_options("start", "stop", "models", "sizes", format="layout of --sequence (default: recognised)"),
@@ -55,21 +56,25 @@ def _eval(a: argparse.Namespace) -> None:
         a.parser.error(f"DIR and --sequence do not go together: --poses {a.run / 'poses'} --sequence {a.sequence}")
     if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
         a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
-    if a.rows and a.run is None:
-        a.parser.error("--rows needs DIR, a run's folder")
+    imported = None
+    if a.poses is not None:
+        from p2p_lib.run import import_poses
+
+        how: dict[str, Any] = {"format": options.format, "start": options.start, "stop": options.stop}
+        imported = import_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how)
     if a.rows:
         from p2p_lib.benchmark.rows import COLUMNS, as_csv
         from p2p_lib.benchmark.scoring import run_rows
-        from p2p_lib.datasets.runs import read_info
+        from p2p_lib.datasets.runs import load_run
 
-        rows = run_rows(a.run, options.models)
-        rows = [row | {"plan": "offline run"} for row in rows] if (read_info(a.run) or {}).get("offline") else rows
+        run = imported or load_run(a.run)
+        rows = run_rows(run, options.models, a.min_visible_px)
+        rows = [row | {"plan": "offline run"} for row in rows] if run.info.get("offline") else rows
         print(as_csv(rows, COLUMNS), end="")
-    elif a.poses is not None:
-        from p2p_lib.run import evaluate_poses
+    elif imported is not None:
+        from p2p_lib.evaluation.protocol import evaluate
 
-        how: dict[str, Any] = {"format": options.format, "start": options.start, "stop": options.stop}
-        _show(evaluate_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how), a.json)
+        _show(evaluate(imported, None, a.align, a.min_visible_px), a.json)
     else:
         _eval_run(a, options)
 

@@ -54,23 +54,25 @@ def scored(done: Run, models: Models, judge: Judge | None, key: str = "", min_ma
     return Outcome(key=key, status="done", ran=ran, objects=objects, left_out=first.left_out)
 
 
-def run_rows(folder: str | Path, models: Models | None = None) -> list[Row]:
-    """Every number of a run folder, each a row (see :mod:`p2p_lib.benchmark.rows`).
+def run_rows(run: str | Path | Run, models: Models | None = None, min_visible_px: int = MIN_VISIBLE_PX) -> list[Row]:
+    """Every number of a run, or of its folder, each a row (see :mod:`p2p_lib.benchmark.rows`).
 
     The Chamfer distance needs the sequence; where that has gone, a row says so.
     """
-    done, models = load_run(folder), models or {}
+    done, models = run if isinstance(run, Run) else load_run(run), models or {}
     name, seed = done.info["sequence"], done.info["seed"]
     try:
-        outcome = scored(done, models, partial(chamfer, done, reopen(done.info), models))
+        judge = partial(chamfer, done, reopen(done.info), models)
+        outcome = scored(done, models, judge, min_mask_px=min_visible_px)
     except MissingData as error:
         gone = {"no_chamfer": str(error)}
-        outcome = scored(done, models, lambda name, score: gone)
+        outcome = scored(done, models, lambda name, score: gone, min_mask_px=min_visible_px)
     method = Method(name=str(done.info["tracker"]))
-    scope = Scope(seeds=[seed], sequence=[PlannedSequence(name=name)])
+    scope = Scope(seeds=[seed or 0], sequence=[PlannedSequence(name=name)])
     plan = Plan(name="run", title="one run", method=[method], quick=scope, full=scope)
-    rows = result_rows(plan, "full", [(Job(method, scope.sequence[0], seed, "poses", True), outcome)])
-    return [row | {"sequence": MEAN_OF_ONE} if row["sequence"] == MEAN else row for row in rows]
+    rows = result_rows(plan, "full", [(Job(method, scope.sequence[0], seed or 0, "poses", True), outcome)])
+    named = {MEAN: MEAN_OF_ONE}
+    return [row | {"seed": seed, "sequence": named.get(row["sequence"], row["sequence"])} for row in rows]
 
 
 def chamfer(done: Run, sequence: Sequence, models: Models, name: str, score: ObjectScore) -> dict[str, Any]:

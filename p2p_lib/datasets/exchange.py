@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData, doubt
+from p2p_lib.core.errors import BadInput, MissingData, did_you_mean, doubt
 from p2p_lib.core.files import check_new, read_text, replace_text
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
@@ -36,6 +36,8 @@ BOP_HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 MATRIX_FOLDERS = ("ob_in_cam", "annotated_poses")
 #: Poses so many times as far apart as frames may have been given the times of another rate.
 _SLOWER = 1.5
+#: Files of no object that are named.
+_NAMED = 3
 
 
 def export(
@@ -108,28 +110,55 @@ def _write_bop(out: Path, run: Run, poses: Mapping[str, np.ndarray], sequence: S
     return [path, ids]
 
 
-def read_poses(path: str | Path, sequence: Sequence) -> dict[str, np.ndarray]:
-    """Object to T_cam_obj (N, 4, 4) over the sequence's frames, NaN where lost; only objects that were found.
+def pose_files(path: str | Path, sequence: Sequence) -> dict[str, Path]:
+    """Object to what holds its poses: a ``.csv`` of all, a ``.txt`` of its own, else its folder of matrices.
 
-    Raises :class:`MissingData` where nothing is there, :class:`BadInput` where it fits no form or no frame.
+    Raises :class:`MissingData` where nothing is there, :class:`BadInput` where it is not clear whose poses they are.
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
-        return _read_bop(path, sequence)
+        return dict.fromkeys(sequence.objects, path)
     if path.is_file():
-        return {_only_object(path, sequence): _read_tum(path, sequence)}
+        return {_only_object(path, sequence): path}
     if not path.is_dir():
         raise MissingData(str(path), "no such file or folder, expected poses (BOP .csv, TUM .txt, or 4x4 matrices)")
     if found := sorted(path.glob("*.csv")):
         if len(found) > 1:
             raise BadInput(str(path), f"{len(found)} .csv files", "one", "Name the one that is meant.")
-        return _read_bop(found[0], sequence)
+        return dict.fromkeys(sequence.objects, found[0])
     folder = next((path / name for name in MATRIX_FOLDERS if (path / name).is_dir()), path)
-    if named := {name: folder / name for name in sequence.objects if (folder / name).is_dir()}:
-        return {name: _read_matrices(where, sequence) for name, where in named.items()}
-    if files := {name: folder / f"{name}.txt" for name in sequence.objects if (folder / f"{name}.txt").is_file()}:
-        return {name: _read_tum(file, sequence) for name, file in files.items()}
-    return {_only_object(folder, sequence): _read_matrices(folder, sequence)}
+    there = {
+        name: next((place for place in (folder / name, folder / f"{name}.txt") if place.exists()), None)
+        for name in sequence.objects
+    }
+    return {name: place for name, place in there.items() if place} or {_only_object(folder, sequence): folder}
+
+
+def read_poses(path: str | Path, sequence: Sequence) -> dict[str, np.ndarray]:
+    """Object to T_cam_obj (N, 4, 4) over the sequence's frames, NaN where lost; only objects that were found.
+
+    Warns of objects that were not. Raises as :func:`pose_files`, and :class:`BadInput` where something fits no form or
+    no frame.
+    """
+    files = pose_files(path, sequence)
+    if tables := {file for file in files.values() if file.suffix.lower() == ".csv"}:
+        poses = _read_bop(tables.pop(), sequence)
+    else:
+        poses = {
+            name: _read_matrices(place, sequence) if place.is_dir() else _read_tum(place, sequence)
+            for name, place in files.items()
+        }
+    if missing := [name for name in sequence.objects if name not in poses]:
+        doubt(str(path), f"no poses of {', '.join(missing)}", _what_else(files, missing))
+    return poses
+
+
+def _what_else(files: Mapping[str, Path], missing: list[str]) -> str:
+    """What to do about objects without poses: what lies beside the others' may be theirs under another name."""
+    beside = {place for file in files.values() if file.suffix.lower() != ".csv" for place in file.parent.iterdir()}
+    other = sorted(p for p in beside - set(files.values()) if p.suffix == ".txt" or (p.is_dir() and p.name[0] != "."))
+    said = [f"{p.name} is of no object. {did_you_mean(p.stem, missing)}" for p in other[:_NAMED]]
+    return " ".join(["What has none is lost throughout.", *said])
 
 
 def as_run(
@@ -155,7 +184,16 @@ def as_run(
             for i in frames
         ]
         objects[name] = ObjectRun.of(name, estimates, sequence, visible_px)
-    info = {"sequence": sequence.name, "objects": list(sequence.objects), "tracker": "imported", "masks": None}
+    info = {
+        "sequence": sequence.name,
+        "path": None if sequence.path is None else str(sequence.path),
+        "format": sequence.format,
+        "scene_seed": getattr(sequence, "scene_seed", None),
+        "objects": list(sequence.objects),
+        "tracker": "imported",
+        "masks": None,
+        "seed": None,
+    }
     return Run(path, info, objects, {name: load_points(file) for name, file in models.items()}, {})
 
 
@@ -200,14 +238,16 @@ def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
     fits = np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.1)
     if not fits.all():
         worst = int(np.argmin(fits))
-        raise BadInput(f"{path}: pose {worst + 1}", " ".join(f"{x:g}" for x in rows[worst]), form)
+        fix = "" if np.isfinite(rows[worst]).all() else "Leave the line out: a frame without a pose is lost."
+        raise BadInput(f"{path}: pose {worst + 1}", " ".join(f"{x:g}" for x in rows[worst]), form, fix)
     times_s, given_s = np.asarray(sequence.times_s), rows[:, 0]
     nearest = np.abs(times_s - given_s[:, None]).argmin(1)
     # Half the time between frames: further off it belongs to none of them.
     far = np.abs(times_s[nearest] - given_s) > 0.5 * (np.median(np.diff(times_s)) if len(times_s) > 1 else 1.0)
     if far.any():
         want = f"times of the sequence's frames, {times_s[0]:.6f} to {times_s[-1]:.6f} s"
-        raise BadInput(str(path), f"the time {given_s[np.argmax(far)]:.6f} s", want)
+        fix = "open_sequence(SEQ).times_s has them in Python; 4x4 files by frame number from 0, and BOP's, need none."
+        raise BadInput(str(path), f"the time {given_s[np.argmax(far)]:.6f} s", want, fix)
     if len(rows) > 2 and (slower := np.median(np.diff(given_s)) / np.median(np.diff(times_s))) > _SLOWER:
         got = f"poses {slower:.1f} times as far apart in time as the frames are"
         doubt(str(path), got, "Frames without a pose count as lost: is the rate right that the times were made with?")

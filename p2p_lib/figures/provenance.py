@@ -159,7 +159,8 @@ def describe(source: Any) -> dict[str, Any]:
         source_info["plan"] = _plan_digest(source.plan, source.profile)
         return {**source_info, "cpu_min": round(source.cpu_min, 1), "runs": keys}
     if isinstance(source, str | Path):
-        return {"file": Path(source).name, "sha256": _sha256(Path(source))}
+        path = Path(source)
+        return _folder(path) if path.is_dir() else {"file": path.name, "sha256": _sha256(path)}
     if hasattr(source, "frame") and hasattr(source, "camera"):
         files = [source.path / name for name in ("cam_K.txt", "scenario.json")] if source.path else []
         checksums = {file.name: _sha256(file) for file in files if file.is_file()}
@@ -194,6 +195,13 @@ def _plain_words(caption: str) -> str:
 
 def _what_ran(info: Mapping[str, Any]) -> dict[str, Any]:
     return {key: info.get(key) for key in _WHAT_RAN} | ({"offline": True} if info.get("offline") else {})
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    """A folder's name, how many files it holds, and a checksum of their names and contents."""
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    listed = "".join(f"{sha256(file)}  {file.relative_to(path).as_posix()}\n" for file in files)
+    return {"folder": path.name, "files": len(files), "sha256": hashlib.sha256(listed.encode()).hexdigest()}
 
 
 def _sha256(path: Path) -> str | None:

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import shutil
 
 import pytest
@@ -10,6 +11,7 @@ from p2p_lib.apps import cli
 from p2p_lib.benchmark.rows import MEAN_OF_ONE, POOLED
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.protocol import evaluate
+from p2p_lib.run import export_run
 
 
 @pytest.fixture
@@ -34,6 +36,21 @@ def test_the_rows_of_a_run_are_those_of_the_benchmark(whole, printed):
         for failures in ("zero", "left out")
         for align in ("first", "all")
     }
+
+
+def test_exported_poses_have_the_rows_of_their_run(whole, tmp_path, printed):
+    folder = whole.out / "runs" / next(outcome.key for job, outcome in whole.results if job.method.name == "Ours")
+    export_run(folder, "poses", tmp_path / "out")
+    sequence = json.loads((folder / "run.json").read_text())["path"]
+    ours, theirs = printed(str(folder)), printed("--poses", str(tmp_path / "out"), "--sequence", sequence)
+    kept = ("object", "metric", "form", "failures", "align", "frames", "lost")
+    numbers = [{tuple(r[c] for c in kept): r["value"] for r in rows if "AUC" in r["metric"]} for rows in (ours, theirs)]
+    assert len(numbers[0]) == len(numbers[1]) > 16
+    for key, value in numbers[0].items():
+        assert float(numbers[1][key]) == pytest.approx(float(value), abs=1e-3)
+    assert {(r["tracker"], r["seed"], r["masks"]) for r in theirs} == {("imported", "", "")}
+    for words in ([str(folder)], ["--poses", str(tmp_path / "out"), "--sequence", sequence]):
+        assert cli.main(["eval", *words, "--rows", "--min-visible-px", "1000000"]) == 2, "no frame is scored"
 
 
 def test_a_surface_is_scored_against_what_was_seen(slides, tmp_path, printed, capsys):

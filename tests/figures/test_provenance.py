@@ -82,6 +82,18 @@ def test_a_note_says_of_an_offline_run_that_it_is_one(made):
     assert provenance.describe(made.run)["run"] != provenance.describe(run)["run"]
 
 
+def test_a_folder_is_told_by_all_that_it_holds(tmp_path):
+    (tmp_path / "theirs/can").mkdir(parents=True)
+    file = tmp_path / "theirs/can/0000.txt"
+    said = []
+    for text, name in (("1", "0000"), ("2", "0000"), ("2", "0001")):
+        file = file.rename(file.with_stem(name)) if file.exists() else file
+        file.write_text(text)
+        said.append(provenance.describe(tmp_path / "theirs"))
+    assert said[0].keys() == {"folder", "files", "sha256"} and (said[0]["folder"], said[0]["files"]) == ("theirs", 1)
+    assert len({one["sha256"] for one in said}) == 3
+
+
 def test_a_note_changes_only_with_what_it_is_of(made, folders, monkeypatch):
     """Drawn again by another commit it stays, so that nothing tracked changes where nothing did."""
     folder, earlier = folders("out"), provenance.provenance

@@ -185,6 +185,17 @@ def test_figures_that_are_asked_for_are_drawn_where_they_are_asked_for(tmp_path,
     assert not (tmp_path / "as_they_were").exists()
 
 
+def test_a_figure_beside_a_competitor_says_whose_poses_it_shows(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper_figures, "return_beside", lambda runs, poses: np.zeros((4, 4, 3), np.uint8))
+    poses = tmp_path / "theirs.txt"
+    poses.write_text("0 0 0 1 0 0 0 1\n")
+    runs = load_benchmark(PLAN, tmp_path)
+    for given in ([], [{"file": "theirs.txt", "sha256": sha256(poses)}]):
+        draw_all(runs, tmp_path / "mine", ["fig5_return"], poses if given else None)
+        sources = json.loads((tmp_path / "mine/fig5_return.json").read_text())["sources"]
+        assert [source for source in sources if "benchmark" not in source] == given
+
+
 def test_a_quick_form_never_takes_the_place_of_a_full_one(tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
     figure = Figure()
