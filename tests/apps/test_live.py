@@ -807,6 +807,7 @@ def test_a_reader_that_goes_away_ends_nothing(capsys):
                 send("x" * 10_000)
                 time.sleep(0.01)
             assert len(said) == 1 and "tracking goes on" in said[0]
+            server.settimeout(20)
             another = server.accept()[0]
             while len(said) < 2:
                 time.sleep(0.001)
