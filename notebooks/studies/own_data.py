@@ -166,7 +166,7 @@ def mask_image(frame: Frame, mask: np.ndarray, title: str, width_px: int = 430) 
     image = overlay.draw_mask(frame.rgb, mask, style.NEUTRAL[1], width_px=1, fill=0.15)
     for pixels, colour in ((on_rim & ~behind, style.OBJECTS[0]), (on_rim & behind, style.STATUS[Status.LOST][0])):
         image[cv2.dilate(pixels.astype(np.uint8), np.ones((2, 2))) > 0] = style.rgb(colour)
-    camera = Camera(1, 1, 0, 0, mask.shape[1], mask.shape[0])
+    camera = Camera(mask.shape[1], mask.shape[1], 0, 0, mask.shape[1], mask.shape[0])
     image, _ = overlay.zoomed(image, camera, overlay.region_around(mask, camera, (30, 30)), width_px)
     share = background_share(mask, frame.depth_m)
     return overlay.draw_caption(image, f"{title}: {100 * share:.0f} % of the rim on the background")

@@ -46,7 +46,13 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     arg("--sequence", metavar="SEQ", help="the sequence that --poses belongs to"),
     run_options("start", "stop", "models", "sizes", format="layout of --sequence (default: recognised)"),
     JSON,
-    arg("--rows", action="store_true", help="every number as a CSV row: all forms, Chamfer, returns"),
+    arg("--rows", action="store_true", help="every number as a CSV row, as in results.csv of p2p benchmark"),
+    arg(
+        "--name",
+        metavar="METHOD",
+        default="",
+        help="its name in --rows (default: of the tracker or of PATH)",
+    ),
     arg("--align", choices=("first", "all"), default="first", help="object frame: by the first scored frame, or all"),
     _MIN_VISIBLE,
 )
@@ -63,12 +69,14 @@ def _eval(a: argparse.Namespace) -> None:
         how: dict[str, Any] = {"format": options.format, "start": options.start, "stop": options.stop}
         imported = import_poses(a.poses, a.sequence, options.models, a.align, a.min_visible_px, **how)
     if a.rows:
+        from p2p_lib.benchmark.plan import PlannedSequence
         from p2p_lib.benchmark.rows import COLUMNS, as_csv
         from p2p_lib.benchmark.scoring import run_rows
         from p2p_lib.datasets.runs import load_run
 
         run = imported or load_run(a.run)
-        rows = run_rows(run, options.models, a.min_visible_px)
+        sequence = PlannedSequence(name=a.sequence or run.info["sequence"], start=options.start, stop=options.stop)
+        rows = run_rows(run, options.models, a.min_visible_px, a.name, sequence)
         rows = [row | {"plan": "offline run"} for row in rows] if run.info.get("offline") else rows
         print(as_csv(rows, COLUMNS), end="")
     elif imported is not None:
@@ -155,7 +163,8 @@ def _eval_tracks(a: argparse.Namespace) -> None:
     arg("--retry", action="store_true", help="try again what failed before"),
     arg("--present", action="store_true", help="instead of plans: all whose data is there, at least in part"),
     output("DIR", "tables with notes of what they are of go here, too", "--tables"),
-    arg("--stale", action="store_true", help="what of figures/ is of earlier code: marked so, with --out made anew"),
+    arg("--stale", action="store_true", help="list what of figures/ is of earlier code; with --out it is made anew"),
+    arg("--mark", action="store_true", help="with --stale: write into tables and figures whether they are"),
     QUIET,
 )
 def _benchmark(a: argparse.Namespace) -> int:
@@ -210,13 +219,14 @@ def _benchmark(a: argparse.Namespace) -> int:
 
 
 def _stale(a: argparse.Namespace) -> int:
-    """What of the figures of a clone is of earlier code is listed, says so itself, and is made anew."""
+    """What of the figures of a clone is of earlier code is listed, and told to say so, or made anew."""
     from p2p_lib.apps.clone import study
     from p2p_lib.core.paths import figure_dir
     from p2p_lib.core.tables import as_text
 
     anew, folder = study("anew"), figure_dir()
-    anew.say_so(folder)
+    if a.mark:
+        anew.say_so(folder)
     found = anew.stale(folder, a.plan)
     print(as_text(found) if len(found) else "All tables and figures are of this code.")
     return 0 if a.out is None else anew.make_anew(folder, a.out, a.plan, partial(print, flush=True))

@@ -15,6 +15,7 @@ from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, Scope
 from p2p_lib.benchmark.rows import MEAN, MEAN_OF_ONE, Row, result_rows
 from p2p_lib.core import se3
 from p2p_lib.core.errors import MissingData
+from p2p_lib.datasets.exchange import IMPORTED
 from p2p_lib.datasets.models import MESHES, find_models, given_models, read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
@@ -54,8 +55,17 @@ def scored(done: Run, models: Models, judge: Judge | None, key: str = "", min_ma
     return Outcome(key=key, status="done", ran=ran, objects=objects, left_out=first.left_out)
 
 
-def run_rows(run: str | Path | Run, models: Models | None = None, min_visible_px: int = MIN_VISIBLE_PX) -> list[Row]:
+def run_rows(
+    run: str | Path | Run,
+    models: Models | None = None,
+    min_visible_px: int = MIN_VISIBLE_PX,
+    method: str = "",
+    sequence: PlannedSequence | None = None,
+) -> list[Row]:
     """Every number of a run, or of its folder, each a row (see :mod:`p2p_lib.benchmark.rows`).
+
+    method    what the rows call it (default: the tracker, of imported poses their file)
+    sequence  what the rows call that, with the frames (default: as the run calls it, and all)
 
     The Chamfer distance needs the sequence; where that has gone, a row says so.
     """
@@ -67,10 +77,10 @@ def run_rows(run: str | Path | Run, models: Models | None = None, min_visible_px
     except MissingData as error:
         gone = {"no_chamfer": str(error)}
         outcome = scored(done, models, lambda name, score: gone, min_mask_px=min_visible_px)
-    method = Method(name=str(done.info["tracker"]))
-    scope = Scope(seeds=[seed or 0], sequence=[PlannedSequence(name=name)])
-    plan = Plan(name="run", title="one run", method=[method], quick=scope, full=scope)
-    rows = result_rows(plan, "full", [(Job(method, scope.sequence[0], seed or 0, "poses", True), outcome)])
+    called = Method(name=method or (done.path.stem if done.info["tracker"] == IMPORTED else str(done.info["tracker"])))
+    scope = Scope(seeds=[seed or 0], sequence=[sequence or PlannedSequence(name=name)])
+    plan = Plan(name="run", title="one run", method=[called], full=scope)
+    rows = result_rows(plan, "full", [(Job(called, scope.sequence[0], seed or 0, "poses", True), outcome)])
     named = {MEAN: MEAN_OF_ONE}
     return [row | {"seed": seed, "sequence": named.get(row["sequence"], row["sequence"])} for row in rows]
 

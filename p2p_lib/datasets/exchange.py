@@ -32,6 +32,8 @@ from p2p_lib.datasets.runs import NO_POSE, ObjectRun, Run, tum_line
 from p2p_lib.datasets.sequence import Sequence
 
 FORMATS = ("tum", "poses", "bop")
+#: What the tracker of poses is called that others have made.
+IMPORTED = "imported"
 BOP_HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 MATRIX_FOLDERS = ("ob_in_cam", "annotated_poses")
 #: Poses so many times as far apart as frames may have been given the times of another rate.
@@ -190,7 +192,7 @@ def as_run(
         "format": sequence.format,
         "scene_seed": getattr(sequence, "scene_seed", None),
         "objects": list(sequence.objects),
-        "tracker": "imported",
+        "tracker": IMPORTED,
         "masks": None,
         "seed": None,
     }

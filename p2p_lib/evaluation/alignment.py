@@ -13,6 +13,11 @@ from p2p_lib.core.types import evenly
 from p2p_lib.evaluation import metrics
 
 
+#: What fits to a tenth of a millimetre fits: the proposal that refinement starts from, which fits its own frame exactly,
+#: would else outweigh all others.
+_EXACT_M = 1e-4
+
+
 def align_first(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
     """T_obj_model (4, 4) from the first of the (m, 4, 4) poses, so that its error is zero.
 
@@ -39,8 +44,7 @@ def align_all(T_cam_obj: np.ndarray, T_cam_model: np.ndarray, points: np.ndarray
     best = tried[np.argmin([_cost(_distances(X, Y, L)) for X in tried])]
     distances = _distances(best, Y, L)
     for _ in range(200):
-        # 1e-9 m: a frame that fits exactly would otherwise have an infinite weight.
-        weights = (distances < metrics.MAX_M) / np.maximum(distances, 1e-9)
+        weights = (distances < metrics.MAX_M) / np.maximum(distances, _EXACT_M)
         if not weights.any():
             break
         X = _nearest_rigid(np.einsum("t,tij->ij", weights / weights.sum(), Y), points)

@@ -102,11 +102,13 @@ def gathered(
     moved   frames whose pose an offline pass has moved far
     """
     n = len(obj)
-    px, size_m, apart = np.full(n, np.nan), np.full(n, np.nan), 0.0
+    px, size_m, cut, apart = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool), 0.0
     if masks is not None:
         rows = np.flatnonzero(np.isin(obj.frame_index, masks.frame_index))
         at = np.searchsorted(masks.frame_index, obj.frame_index[rows])
         px[rows], size_m[rows] = masks.px[at], masks.size_m[at]
+        if sequence is not None:
+            cut[rows] = masks.at_the_border(sequence.camera)[at]
         apart = _apart(masks)
     of_points = np.full((4, n), np.nan)
     if keypoints is not None and sequence is not None:
@@ -116,7 +118,7 @@ def gathered(
     seen, inside, off_px, jump_px = of_points
     of_surface = fit.overlap, fit.through, fit.on_surface
     far = np.isin(obj.frame_index, list(moved))
-    return RunEvidence(*of_poses, px, size_m, seen, inside, off_px, jump_px, *of_surface, far, doubts, apart)
+    return RunEvidence(*of_poses, px, size_m, cut, seen, inside, off_px, jump_px, *of_surface, far, doubts, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

@@ -32,13 +32,15 @@ _OFTEN = 0.9
 class Lengths:
     """One object's length, m, as known and as measured; NaN: not measured.
 
-    mask_m  the length of what masks hold, where they show the most of it
-    mesh_m  the longest side of the reconstructed surface
+    mask_m   the length of what masks hold, where they show the most of it
+    mesh_m   the longest side of a box around the reconstructed surface
+    across   how much longer than a side of the object that may be, where a part of the surface lies askew in its box
     """
 
     known_m: float
     mask_m: float
     mesh_m: float = float("nan")
+    across: float = 1.0
 
     @property
     def doubt(self) -> str:
@@ -58,13 +60,17 @@ class Lengths:
         """That it is measured as long as it is known to be, in words; "" where it is not, or not measured."""
         if self.doubt or not self._measured:
             return ""
-        least_m, most_m = _fitting_m(*list(self._measured.items())[-1])
+        least_m, most_m = self._fitting_m(*list(self._measured.items())[-1])
         given = f"{100 * self.known_m:g} cm given"
         return f"measured {self._found}, {given}: fits, as {100 * least_m:.0f} to {100 * most_m:.0f} cm would"
 
     def _fits(self, what: str, m: float) -> bool:
-        least_m, most_m = _fitting_m(what, m)
+        least_m, most_m = self._fitting_m(what, m)
         return least_m <= self.known_m <= most_m
+
+    def _fitting_m(self, what: str, m: float) -> tuple[float, float]:
+        """Between which lengths, m, something is that was measured ``m`` long."""
+        return (m - SLACK_M) / (LONGER * (_ACROSS if what == _MASKS else self.across)), m / SHORTER
 
     @property
     def _measured(self) -> dict[str, float]:
@@ -74,11 +80,6 @@ class Lengths:
     @property
     def _found(self) -> str:
         return " and ".join(f"{100 * m:.1f} cm {what}" for what, m in self._measured.items())
-
-
-def _fitting_m(what: str, m: float) -> tuple[float, float]:
-    """Between which lengths, m, something is that was measured ``m`` long."""
-    return (m - SLACK_M) / (LONGER * (_ACROSS if what == _MASKS else 1.0)), m / SHORTER
 
 
 def in_masks_m(sizes_m: np.ndarray) -> float:
@@ -92,7 +93,7 @@ def lengths(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, Lengt
     masks, found = load_masks(folder) if known_m else {}, {}
     for name, length_m in known_m.items():
         mask_m = in_masks_m(masks[name].size_m) if name in masks else float("nan")
-        found[name] = Lengths(length_m, mask_m, mesh_length_m(Path(folder) / "meshes" / f"{name}.ply"))
+        found[name] = Lengths(length_m, mask_m, *mesh_length_m(Path(folder) / "meshes" / f"{name}.ply"))
     return found
 
 
@@ -101,15 +102,19 @@ def that_fit(measured: Mapping[str, Lengths]) -> list[str]:
     return [f"{name}: {of.fit}" for name, of in measured.items() if of.fit]
 
 
-def mesh_length_m(path: Path) -> float:
-    """The longest side of a box around a surface without its shreds; NaN where there is none."""
+def mesh_length_m(path: Path) -> tuple[float, float]:
+    """The longest side, m, of a box around a surface without its shreds, and how much longer its face's diagonal is.
+
+    Two faces of a cube are a box as long as the diagonal of a third. NaN where there is no surface.
+    """
     if not path.is_file():
-        return float("nan")
+        return float("nan"), 1.0
     import trimesh
 
     mesh = trimesh.load_mesh(path)
     if len(mesh.vertices) < 4:
-        return float("nan")
+        return float("nan"), 1.0
     p, _ = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)
     sides = p @ np.linalg.inv(oriented_box(mesh)[0])[:3, :3]
-    return float(np.ptp(np.quantile(sides, [_SHREDS, 1 - _SHREDS], axis=0), axis=0).max())
+    _, wide_m, long_m = np.sort(np.ptp(np.quantile(sides, [_SHREDS, 1 - _SHREDS], axis=0), axis=0)).tolist()
+    return long_m, float(np.hypot(1, wide_m / long_m))

@@ -45,6 +45,7 @@ class RunEvidence:
     has_pose      (n,) bool, in the map that is kept; elsewhere (n,) bool: a pose, in a map that was given up
     confidence    (n,)
     mask_px       (n,) pixels of the mask that served, size_m (n,) the length of what it holds
+    cut           (n,) bool: the image ends where the mask does
     keypoints     (n,) how many of the object's own were seen, inside (n,) the share of them in its mask
     off_px        (n,) median distance of these from where the pose puts them
     jump_px       (n,) how differently from what was seen the poses moved them since the frame before
@@ -61,6 +62,7 @@ class RunEvidence:
     confidence: np.ndarray
     mask_px: np.ndarray
     size_m: np.ndarray
+    cut: np.ndarray
     keypoints: np.ndarray
     inside: np.ndarray
     off_px: np.ndarray
@@ -76,6 +78,12 @@ class RunEvidence:
     def seen(self) -> np.ndarray:
         """(n,) bool: the mask is large enough to count."""
         return np.nan_to_num(self.mask_px) >= MIN_VISIBLE_PX
+
+    @property
+    def usual_m(self) -> float:
+        """The length of what masks hold that the image does not cut; of all, where it cuts all."""
+        whole = self.seen & ~self.cut
+        return median_of_known(self.size_m[whole if np.isfinite(self.size_m[whole]).any() else self.seen])
 
     @property
     def carried(self) -> np.ndarray:
@@ -176,7 +184,7 @@ _RULES = (
         "grown",
         f"the mask spans more than {GROWN:g} times the object's usual length",
         0.05,
-        lambda e: e.size_m > GROWN * median_of_known(e.size_m[e.seen]),
+        lambda e: e.size_m > GROWN * e.usual_m,
         lambda e: e.seen & np.isfinite(e.size_m),
     ),
 )

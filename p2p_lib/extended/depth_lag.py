@@ -91,14 +91,18 @@ class DepthLag:
         return motion
 
 
+def says_so(doubt: str) -> bool:
+    """Whether a doubt is that of a run that moves depth onto its colour."""
+    return DepthLag().doubt[0].partition(",")[0] in doubt
+
+
 def as_the_run_took(sequence: Sequence, i: int, doubts: Iterable[str]) -> Frame:
     """Frame i of a run's sequence, its depth moved onto its colour where the run had to do so.
 
     doubts  of the run (``run.json``)
     """
     frame, lag = sequence.frame(i), DepthLag()
-    apart = lag.doubt[0].partition(",")[0]
-    if not i or not any(apart in doubt for doubt in doubts):
+    if not i or not any(map(says_so, doubts)):
         return frame
     lag.off_px = 1.0  # small offsets count, too
     lag.moved(sequence.frame(i - 1))

@@ -51,10 +51,20 @@ def test_a_mesh_is_as_long_as_its_longest_side_however_it_lies_and_whatever_stic
     box = trimesh.creation.box((0.2, 0.1, 0.05), turn)
     shred = trimesh.creation.box((0.3, 0.002, 0.002), turn)
     trimesh.util.concatenate([box, shred]).export(tmp_path / "box.ply")
-    assert mesh_length_m(tmp_path / "box.ply") == pytest.approx(
-        0.2, rel=0.02
-    )  # the box fitted around it is not the smallest to the last percent
-    assert np.isnan(mesh_length_m(tmp_path / "none.ply"))
+    long_m, across = mesh_length_m(tmp_path / "box.ply")
+    assert across == pytest.approx(np.hypot(1, 0.5), rel=0.02)
+    assert long_m == pytest.approx(0.2, rel=0.02)  # the box fitted around it is not the smallest to the last percent
+    assert np.isnan(mesh_length_m(tmp_path / "none.ply")[0])
+
+
+def test_two_faces_of_a_cube_are_no_longer_cube(tmp_path):
+    """Seen from one edge, a box around them is as long as the diagonal of a third face."""
+    cube = trimesh.creation.box((0.1, 0.1, 0.1))
+    cube.update_faces(cube.face_normals[:, :2].sum(1) > 0.5)
+    cube.export(tmp_path / "cube.ply")
+    long_m, across = mesh_length_m(tmp_path / "cube.ply")
+    assert long_m > 0.13 and not Lengths(0.1, NAN, long_m, across).doubt
+    assert Lengths(0.1, NAN, long_m).doubt
 
 
 def test_a_size_in_metres_is_told_from_a_wrong_camera():

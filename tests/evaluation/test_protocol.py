@@ -201,6 +201,21 @@ def test_all_finds_the_minimum_of_its_cost():
     assert cost(best) < min(worse)
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_all_leaves_the_frame_that_it_starts_from(seed):
+    """Rotations are exact, positions are not: no constant at all fits better than what fits one frame exactly."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(scale=0.05, size=(200, 3))
+    truth = se3.exp(rng.normal(size=(38, 6)) * ([0.6] * 3 + [0.1] * 3))
+    tracked = truth.copy()
+    tracked[:, :3, 3] += rng.normal(scale=0.002, size=(38, 3))
+
+    def cost(T_obj_model):
+        return np.linalg.norm((tracked @ T_obj_model - truth)[:, :3, 3], axis=1).sum()
+
+    assert cost(align_all(tracked, truth, points)) < cost(np.eye(4))
+
+
 @pytest.mark.parametrize("flatness", [[1, 1, 0], [1, 0, 0]])
 def test_all_copes_with_flat_and_thin_models(flatness):
     rng = np.random.default_rng(12)

@@ -16,7 +16,7 @@ def spotless() -> RunEvidence:
     numbers = {"mask_px": 5000, "size_m": 0.15, "keypoints": 40, "inside": 1, "off_px": 0.5, "jump_px": 0.2}
     numbers |= {"overlap": 0.9, "through": 0.01, "on_surface": 0.8, "confidence": 0.9}
     numbers = {key: value * full for key, value in numbers.items()}
-    return RunEvidence(frame_index=10 + ROWS, has_pose=full > 0, elsewhere=full < 0, moved=full < 0, **numbers)
+    return RunEvidence(10 + ROWS, has_pose=full > 0, elsewhere=full < 0, moved=full < 0, cut=full < 0, **numbers)
 
 
 def with_some(e: RunEvidence, share: float, **wrong: float) -> RunEvidence:
@@ -108,8 +108,17 @@ def test_what_is_not_known_is_not_held_against_anybody():
         "elsewhere",
         "confidence",
         "moved",
+        "cut",
         "doubts",
         "apart",
     }
     nothing = replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})
     assert suspicions(nothing) == () and spotless().compared and not nothing.compared
+
+
+def test_what_the_image_cuts_is_not_the_usual_length():
+    """Most of a run shows half of it at the image's end: the frames before are not too long for that."""
+    half = with_some(spotless(), 0.7, size_m=0.07)
+    assert [s.rule for s in suspicions(half)] == ["grown"]
+    assert not suspicions(replace(half, cut=half.size_m < 0.1))
+    assert not suspicions(replace(spotless(), cut=ROWS >= 0))

@@ -3,6 +3,7 @@
 import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -148,7 +149,7 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
     prompt = Prompt("left", points_px=[[110, 100]])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        doubt_prompt(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others, True)
+        doubt_prompt(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others, False)
     assert bool(caught) == said
     if said:
         text = r"3600 pixels selected; a mask of 6600 fits as well. If pixel \((\d+), (\d+)\)"
@@ -473,15 +474,39 @@ def test_what_selects_nothing_leaves_an_object_its_mask(say):
     assert iou(kept, LEFT) > 0.9 and iou(follow.segment(picture(2)) == 1, LEFT) > 0.9
 
 
-def test_doubts_are_of_what_a_prompt_has_started_alone(monkeypatch):
-    """What is said of a correction says nothing of how the object began."""
-    monkeypatch.setattr(built_in, "doubt_prompt", lambda cutter, *more: "odd")
+def test_doubts_are_of_the_newest_prompts(monkeypatch):
+    """Whether one began a mask, or mended it, and whether that was far from another."""
+    monkeypatch.setattr(built_in, "doubt_prompt", lambda cutter, mask, others, elsewhere: f"{elsewhere}")
     cutter = segmenter()
     cutter.segment(picture(), [Prompt("left", points_px=[[120, 110]])])
-    assert cutter.doubts == {"left": "odd"}
+    assert cutter.doubts == {"left": "False"}
     cutter.segment(picture(1), [Prompt("left", points_px=[[121, 111]]), Prompt("right", points_px=[[174, 109]])])
-    assert cutter.doubts == {"right": "odd"}
+    assert cutter.doubts == {"left": "None", "right": "False"}
     cutter.segment(picture(2))
     assert cutter.doubts == {}
     cutter.segment(picture(3), [Prompt("left", points_px=[[40, 35]])])
-    assert cutter.doubts == {"left": "odd"}, "far from what it was followed by: that is a start"
+    assert cutter.doubts == {"left": "True"}, "far from what it was followed by"
+
+
+@pytest.mark.parametrize(
+    ("was", "say", "said"),
+    [
+        (LEFT, {"points_px": [[122, 112]]}, ""),
+        (WALL, {"points_px": [[120, 110]]}, "farther from its mask than that is long. It starts anew there."),
+        (LEFT, {"points_px": [[290, 220]]}, "check that depth is in metres."),
+    ],
+)
+def test_a_correction_that_starts_anew_is_doubted(was, say, said):
+    follow = segmenter()
+    follow.segment(picture(0), [Prompt("left", mask=was)])
+    with warnings.catch_warnings(record=True):
+        warnings.simplefilter("always")
+        follow.segment(picture(1), [Prompt("left", 1, **say)])
+    assert follow.doubts.get("left", "").endswith(said) and bool(follow.doubts) == bool(said)
+
+
+def test_a_click_that_the_mask_goes_against_all_the_same_is_named(recwarn):
+    cutter = SimpleNamespace(prompt=Prompt("left", 1, [[110, 100], [40, 35]], [[100, 90]]), frame=picture(1))
+    assert "(40, 35) is outside its mask all the same" in doubt_prompt(cutter, LEFT, {}, None)
+    cutter.prompt = Prompt("left", 1, [[110, 100]], [[100, 90]])
+    assert "(100, 90) is inside its mask all the same" in doubt_prompt(cutter, LEFT, {}, None)

@@ -62,7 +62,7 @@ def untold(folder: Path) -> list[str]:
 
 
 def test_whatever_earlier_code_made_says_so():
-    assert untold(FIGURES) == [], "Run: p2p benchmark --stale"
+    assert untold(FIGURES) == [], "Run: p2p benchmark --stale --mark"
 
 
 def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeypatch):
@@ -114,7 +114,7 @@ def test_what_is_stale_is_made_anew_where_it_lies_each_command_once(tmp_path, mo
 def test_the_index_is_current():
     text = (FIGURES / "README.md").read_text()
     days = dict(re.findall(r"\| ([0-9a-f]{7}) (\d{4}-\d\d-\d\d)", text))
-    assert index(FIGURES, lambda commit: days.get(commit[:7], "")) == text, "Run: p2p benchmark --stale"
+    assert index(FIGURES, lambda commit: days.get(commit[:7], "")) == text, "Run: p2p benchmark --stale --mark"
 
 
 def test_committed_figures_are_small():

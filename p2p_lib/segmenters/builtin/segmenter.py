@@ -61,8 +61,7 @@ class BuiltinSegmenter:
     """The segmenter without learned weights. Implements :class:`p2p_lib.core.interfaces.Segmenter`.
 
     refiner  may replace an object's mask in a frame, before it is labelled and learnt from
-    doubts   of objects that a prompt of the newest frame has started, or moved elsewhere: what is doubtful about their
-             masks
+    doubts   of objects that a prompt of the newest frame has started or corrected: what is doubtful about their masks
     """
 
     def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
@@ -72,7 +71,8 @@ class BuiltinSegmenter:
         self._previous: Frame | None = None
         self._frames = 0
         self.doubts: dict[str, str] = {}
-        self._begun: set[str] = set()  # whose masks prompts of the newest frame did not mend, but began
+        # Whose masks prompts of the newest frame did not mend, but began; and whether it had another one elsewhere.
+        self._begun: dict[str, bool] = {}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,7 +96,7 @@ class BuiltinSegmenter:
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
-        self._begun = set()
+        self._begun = {}
         corrected = [
             name
             for name, cutter in cutters.items()
@@ -183,7 +183,7 @@ class BuiltinSegmenter:
             return Target(), cutter.correct(was) if was.any() else None
         mends = was.any() and not cutter.leaves(was)
         if not mends:
-            self._begun.add(cutter.prompt.name)
+            self._begun[cutter.prompt.name] = bool(was.any())
         box, x = cutter.correct(was) if mends and cutter.prompt.box_px is None else cutter.start()
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             doubt_nothing(cutter, "It keeps the mask that it had.")
@@ -275,13 +275,13 @@ class BuiltinSegmenter:
         return labels
 
     def _doubts(self, labels: np.ndarray, cutters: Mapping[str, Cutter]) -> dict[str, str]:
-        """Warn if a prompt has selected nothing, or if one that began a mask may have selected something else."""
+        """Warn if a prompt has selected nothing, may have selected something else, or was not followed."""
         masks = {name: labels == label for label, name in enumerate(self._targets, 1)}
         said = {}
         for name, cutter in cutters.items():
             others = {other: mask for other, mask in masks.items() if other != name}
-            said[name] = doubt_prompt(cutter, masks[name], others, name in self._begun)
-        return {name: said[name] for name in self._begun if said[name]}
+            said[name] = doubt_prompt(cutter, masks[name], others, self._begun.get(name))
+        return {name: text for name, text in said.items() if text}
 
 
 def _cutter(view: View, prompt: Prompt, prompt_of: Mapping[str, Prompt]) -> Cutter:

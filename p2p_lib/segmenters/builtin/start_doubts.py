@@ -25,19 +25,19 @@ _FEW = 10
 _AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
 
 
-def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], starts: bool) -> str:
-    """Warn if a prompt has selected nothing, or one that started an object may have selected something else.
+def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], elsewhere: bool | None) -> str:
+    """Warn if a prompt has selected nothing, or something else than its object, or has not mended its mask.
 
     Returns the warning; empty where nothing is doubtful.
 
-    cutter  the one that cut it out, with a mask (H, W) bool
-    others  the other objects' masks (H, W) bool in this frame
-    starts  whether it started the object: what was right before its correction is known to the user
+    cutter     the one that cut it out, with a mask (H, W) bool
+    others     the other objects' masks (H, W) bool in this frame
+    elsewhere  of a mask that it began, whether its object had another one far from the clicks; None where it mended it
     """
     if not mask.any():
         return doubt_nothing(cutter)
-    if not starts:
-        return ""
+    if elsewhere is None:
+        return _not_mended(cutter, mask)
     frame, who = cutter.frame, _who(cutter)
     rows, columns = bounds(mask)
     corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
@@ -58,7 +58,20 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
         got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
         fix = f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it."
         return doubt(who, got, fix)
+    if elsewhere:
+        return doubt(who, "they are farther from its mask than that is long", "It starts anew there.")
     return ""
+
+
+def _not_mended(cutter: Cutter, mask: np.ndarray) -> str:
+    """Warn of clicks that the mended mask (H, W) bool goes against."""
+    on, beside = cutter.prompt.points_px, cutter.prompt.negative_px
+    missed, held = on[~in_mask(on, mask)], beside[in_mask(beside, mask)]
+    if not len(missed) and not len(held):
+        return ""
+    (u, v), where = (missed[0], "outside") if len(missed) else (held[0], "inside")
+    fix = "Click where it has depth and is one piece with the object, draw a box, or paint the mask."
+    return doubt(_who(cutter), f"({u:.0f}, {v:.0f}) is {where} its mask all the same", fix)
 
 
 def doubt_nothing(cutter: Cutter, instead: str = "") -> str:
