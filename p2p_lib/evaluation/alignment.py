@@ -12,9 +12,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.types import evenly
 from p2p_lib.evaluation import metrics
 
-
-#: What fits to a tenth of a millimetre fits: the proposal that refinement starts from, which fits its own frame exactly,
-#: would else outweigh all others.
+#: What fits to a tenth of a millimetre fits, m: the proposal that refinement starts from, which fits its own frame
+#: exactly, would else outweigh all others.
 _EXACT_M = 1e-4
 
 
