@@ -42,7 +42,7 @@ _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace",
         "sequence",
         nargs="?",
         metavar="SEQ",
-        help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA",
+        help="a folder, synthetic/NAME or NAME@SEED (bundled), or a name below $P2P_DATA (with --resume: as it began)",
     ),
     arg(
         "--batch",
@@ -73,6 +73,8 @@ _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace",
     QUIET,
 )
 def _run(a: argparse.Namespace) -> int:
+    if a.sequence is None and a.batch is None and a.if_exists == "resume":
+        a.sequence = _sequence_of(a.out)
     if (a.sequence is None) == (a.batch is None):
         a.parser.error("needs either SEQ or --batch FOLDER")
     if a.batch is not None and (a.if_exists == "replace" or a.overlay is not None):
@@ -232,6 +234,14 @@ def _live(a: argparse.Namespace) -> None:
     finally:
         camera.close()
     warn("\n".join([str(count), *(_without_map(a.out) if a.out is not None else ())]))
+
+
+def _sequence_of(out: Path) -> str | None:
+    """What the run in a folder is of, in the words of who made it; None where there is no run."""
+    from p2p_lib.datasets.runs import read_info
+
+    info = read_info(out)
+    return None if info is None else info["path"] or info["sequence"]
 
 
 def _asked(a: argparse.Namespace, goes_on: Path | None = None) -> RunOptions:

@@ -288,6 +288,9 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert run(sequence, out, *words) == 0
     assert "which is finished" in (err := capsys.readouterr().err) and contents(out) == before and "left out" not in err
     assert cli.main(["run", str(sequence), "--out", str(out), "--resume", "--quiet"]) == 0 and contents(out) == before
+    assert cli.main(["run", "--out", str(out), "--resume", "--quiet"]) == 0 and contents(out) == before
+    with pytest.raises(SystemExit):  # nothing says of what
+        cli.main(["run", "--out", str(tmp_path / "none"), "--resume", "--quiet"])
     taken = f"left out, and taken from the run in {out}: --set method.surface=false --set method.graph=false --seed 7"
     assert taken in capsys.readouterr().err.replace("'", "")
     assert run(sequence, out, "--seed", "8", "--resume") == 2
