@@ -81,7 +81,7 @@ def test_matrices_have_no_order_of_quaternions():
     assert doubt_reading(run_of(scalar_first(truth), truth)) == ""
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_right_poses_are_never_doubted_however_noisy(seed):
     """Objects that move, and that hardly do, noise from none to a score of nothing."""
     rng = np.random.default_rng(seed)
