@@ -49,6 +49,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
     arg("--rows", action="store_true", help="every number as a CSV row, as in results.csv of p2p benchmark"),
     arg(
         "--name",
+        dest="method",
         metavar="METHOD",
         default="",
         help="its name in --rows (default: of the tracker or of PATH)",
@@ -76,7 +77,7 @@ def _eval(a: argparse.Namespace) -> None:
 
         run = imported or load_run(a.run)
         sequence = PlannedSequence(name=a.sequence or run.info["sequence"], start=options.start, stop=options.stop)
-        rows = run_rows(run, options.models, a.min_visible_px, a.name, sequence)
+        rows = run_rows(run, options.models, a.min_visible_px, a.method, sequence)
         rows = [row | {"plan": "offline run"} for row in rows] if run.info.get("offline") else rows
         print(as_csv(rows, COLUMNS), end="")
     elif imported is not None:

@@ -49,6 +49,9 @@ def test_exported_poses_have_the_rows_of_their_run(whole, tmp_path, printed):
     for key, value in numbers[0].items():
         assert float(numbers[1][key]) == pytest.approx(float(value), abs=1e-3)
     assert {(r["tracker"], r["seed"], r["masks"]) for r in theirs} == {("imported", "", "")}
+    assert {(r["method"], r["sequence"]) for r in theirs if r["object"]} == {("out", sequence)}, "as they were typed"
+    named = printed("--poses", str(tmp_path / "out"), "--sequence", sequence, "--name", "theirs", "--stop", "5")
+    assert {(r["method"], r["sequence"]) for r in named if r["object"]} == {("theirs", f"{sequence}[0:5]")}
     for words in ([str(folder)], ["--poses", str(tmp_path / "out"), "--sequence", sequence]):
         assert cli.main(["eval", *words, "--rows", "--min-visible-px", "1000000"]) == 2, "no frame is scored"
 

@@ -124,6 +124,10 @@ def test_open3ds_recordings_are_read_as_open3d_reads_them(tmp_path):
     assert open_sequence(folder).format == "folder"
     same(open_sequence(folder))
     (folder / "rgb").rename(folder / "color")
+    lens = open3d.camera.PinholeCameraIntrinsic(2 * W, 2 * H, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    open3d.io.write_pinhole_camera_intrinsic(str(folder / "camera_intrinsic.json"), lens)
+    with pytest.raises(BadInput, match=f"the camera of images of {2 * W}x{2 * H}, expected that of these, {W}x{H}"):
+        open_sequence(folder)
     (folder / "camera_intrinsic.json").unlink()
     with pytest.raises(MissingData, match=r"intrinsic\.json, as Open3D's layout .*name that with --format"):
         open_sequence(folder)
