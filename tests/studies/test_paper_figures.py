@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from p2p_lib.apps import cli
 from p2p_lib.benchmark import load_benchmark, plan_names, read_plan
 from p2p_lib.core.paths import PROJECT
 from p2p_lib.datasets.download import sha256
@@ -92,6 +93,9 @@ def test_a_table_of_earlier_code_says_so_until_it_is_made_anew(tmp_path, monkeyp
     assert untold(tmp_path) == ["tables/readme.md"], "its plan asks for something else by now"
     (tmp_path / "tables/readme.json").write_text(json.dumps(note | {"sources": [runs | {"runs": []}]}))
     assert untold(tmp_path) == ["tables/readme.md"], "a table of dashes has rows of its plan, too"
+    monkeypatch.setenv("P2P_FIGURES", str(tmp_path))
+    assert cli.main(["benchmark", "--stale"]) == 0 and untold(tmp_path) == ["tables/readme.md"], "a question"
+    assert cli.main(["benchmark", "--stale", "--mark"]) == 0 and untold(tmp_path) == []
 
 
 def test_what_is_stale_is_made_anew_where_it_lies_each_command_once(tmp_path, monkeypatch):
