@@ -171,9 +171,10 @@ def import_poses(
     start: int = 0,
     stop: int | None = None,
 ) -> Run:
-    """Any method's poses (:mod:`p2p_lib.datasets.exchange`) over these frames, ready to be scored as a run of ours.
+    """Any method's poses (:mod:`p2p_lib.datasets.exchange`) over these frames, to be scored as a run of ours is.
 
-    Warns where they would score far better in another convention (:mod:`p2p_lib.evaluation.readings`).
+    Warns where they would score far better in another convention (:mod:`p2p_lib.evaluation.readings`); :func:`evaluate`
+    scores them as they were given.
     """
     sequence = sequences.open_sequence(sequence, format)
     known = find_models(sequence) | given_models(models or {}, sequence.objects)
@@ -183,21 +184,6 @@ def import_poses(
     quaternions = {name for name, file in written.items() if file.is_file() and file.suffix.lower() != ".csv"}
     doubt_reading(run, quaternions, align, min_visible_px)
     return run
-
-
-def evaluate_poses(
-    poses: str | Path,
-    sequence: str | Path | sequences.Sequence,
-    models: Mapping[str, str | Path] | None = None,
-    align: str = "first",
-    min_visible_px: int = 300,
-    format: str | None = None,
-    start: int = 0,
-    stop: int | None = None,
-) -> Evaluation:
-    """Score any method's poses by the rules of a run of ours over these frames, see :func:`import_poses`."""
-    run = import_poses(poses, sequence, models, align, min_visible_px, format, start, stop)
-    return evaluate(run, None, align, min_visible_px)
 
 
 def export_run(

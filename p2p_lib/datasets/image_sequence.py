@@ -182,31 +182,25 @@ def image_files(folder: Path) -> ImageSequence:
 
 def camera_of(folder: Path, rgb: Sequence[Path]) -> Camera:
     """The camera of a folder's images, for whose size its file may be."""
-    K, name = read_K(folder)
+    K, name, size = read_K(folder)
     camera = camera_for(rgb, K, name)
-    lens = _recorded(folder)
-    if lens is not None and name == str(lens[0]) and lens[1].width and lens[1].height:
-        got, expected = (f"{of.width}x{of.height}" for of in (lens[1], camera))
-        if got != expected:
-            raise BadInput(name, f"the camera of images of {got}", f"that of these, {expected}", WRITE_K)
+    if size not in (None, (camera.width, camera.height)):
+        got, expected = "the camera of images of {}x{}".format(*size), f"that of these, {camera.width}x{camera.height}"
+        raise BadInput(name, got, expected, WRITE_K)
     return camera
 
 
-def _recorded(folder: Path) -> tuple[Path, _Intrinsic] | None:
-    """The JSON of Open3D's recorders and what it holds, where there is one."""
-    path = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
-    return None if path is None else (path, read_json(path, _Intrinsic, "a pinhole camera as Open3D writes it"))
-
-
-def read_K(folder: Path) -> tuple[np.ndarray, str]:
-    """The camera matrix (3, 3) and its file; errors say what to write.
+def read_K(folder: Path) -> tuple[np.ndarray, str, tuple[int, int] | None]:
+    """The camera matrix (3, 3), its file, and the width and height that it says it is for; errors say what to write.
 
     That is ``cam_K.txt``, in three lines or in one, or where there is none the JSON that Open3D's recorders write.
     """
     path, expected = folder / "cam_K.txt", "a 3x3 camera matrix in pixels"
-    if not path.is_file() and (recorded := _recorded(folder)) is not None:
-        name, lens = recorded
-        return np.array(lens.intrinsic_matrix).reshape(3, 3).T, str(name)  # it is written column by column
+    recorded = next((folder / name for name in INTRINSICS if (folder / name).is_file()), None)
+    if recorded is not None and not path.is_file():
+        lens = read_json(recorded, _Intrinsic, "a pinhole camera as Open3D writes it")
+        size = (lens.width, lens.height) if lens.width and lens.height else None
+        return np.array(lens.intrinsic_matrix).reshape(3, 3).T, str(recorded), size  # it is written column by column
     try:
         K = images.read_numbers(path, expected)
     except MissingData as error:
@@ -214,4 +208,4 @@ def read_K(folder: Path) -> tuple[np.ndarray, str]:
     if K.size != 9:
         decimals = "A comma parts numbers: write decimals with a point, as 913.05."
         raise BadInput(str(path), f"{K.size} numbers", expected, decimals if K.size == 18 else WRITE_K)
-    return K.reshape(3, 3), str(path)
+    return K.reshape(3, 3), str(path), None

@@ -65,6 +65,6 @@ def _K(folder: Path) -> tuple[np.ndarray, str]:
     path = folder / "cam_K.txt"
     known = re.search("|".join(KINECTS), images.full(folder).name)
     if path.is_file() or known is None:
-        return read_K(folder)
+        return read_K(folder)[:2]
     fx, fy, cx, cy = KINECTS[known[0]]
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), f"the camera of {known[0]}"

@@ -21,7 +21,7 @@ from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.protocol import evaluate, model_frames
 from p2p_lib.offline import PRODUCTS
-from p2p_lib.run import evaluate_poses, export_run
+from p2p_lib.run import export_run, import_poses
 
 W, H, N = 40, 30, 12
 STEMS = [str(1581120424100262102 + i * 33_000_000) for i in range(N)]  # nanoseconds, as YCBInEOAT names pictures
@@ -107,7 +107,7 @@ def test_every_form_keeps_every_pose_and_every_loss(table, scene, tmp_path, layo
         np.testing.assert_allclose(read[name][~lost], (obj.T_cam_obj @ T_obj_frame)[~lost], atol=3e-8)
     # The same poses get the same scores, whichever way they come.
     ours = evaluate(load_run(tmp_path / "run")).as_dict()
-    theirs = evaluate_poses(tmp_path / "out", folder).as_dict()
+    theirs = evaluate(import_poses(tmp_path / "out", folder)).as_dict()
     assert 60 < ours["mean"]["add_auc"] < 99 and ours["objects"].keys() == theirs["objects"].keys()
     for name, score in ours["objects"].items():
         got = theirs["objects"][name]
@@ -294,7 +294,7 @@ def test_matrices_as_bundlesdf_writes_them(bottle, tmp_path, names, sub):
     assert np.isnan(T[[4, 5, 6]]).all()
     model = {"object": str(bottle.resolve().parent / "points.xyz")}
     np.savetxt(model["object"], np.random.default_rng(0).normal(0, 0.03, (50, 3)))
-    [score] = evaluate_poses(tmp_path / "theirs", bottle, model).as_dict()["objects"].values()
+    [score] = evaluate(import_poses(tmp_path / "theirs", bottle, model)).as_dict()["objects"].values()
     assert (score["frames"], score["lost"]) == (N, 3)
     assert score["add_auc"] == pytest.approx(100 * (N - 3) / N)
 
@@ -304,7 +304,7 @@ def test_an_object_without_poses_is_lost_not_left_out(table, tmp_path):
     for stem, T in zip(STEMS, truth_of(1)):
         np.savetxt(tmp_path / "theirs" / "can" / f"{stem}.txt", T)
     with pytest.warns(Doubt, match=r"theirs: no poses of box. What has none is lost throughout\.$"):
-        scores = evaluate_poses(tmp_path / "theirs", table).as_dict()
+        scores = evaluate(import_poses(tmp_path / "theirs", table)).as_dict()
     assert scores["objects"]["box"]["lost"] == N and scores["objects"]["box"]["add_auc"] == 0
     assert scores["mean"]["add_auc"] == pytest.approx(50)
 
@@ -336,7 +336,7 @@ def test_only_what_holds_quaternions_may_have_them_in_another_order(table, tmp_p
     export_run(tmp_path / "run", format, tmp_path / "out")
     asked = []
     monkeypatch.setattr("p2p_lib.run.doubt_reading", lambda *args: asked.append(args))
-    evaluate_poses(tmp_path / "out", table, align="all", min_visible_px=7)
+    import_poses(tmp_path / "out", table, align="all", min_visible_px=7)
     ((run, quaternions, *how),) = asked
     assert quaternions == (set(run.objects) if format == "tum" else set()) and how == ["all", 7]
 
@@ -345,12 +345,12 @@ def test_only_some_frames(table, tmp_path):
     """A run over part of a sequence, and another method's poses over the same part, get the same scores."""
     run_on(table, tmp_path / "run")
     export_run(tmp_path / "run", "poses", tmp_path / "out")
-    whole = evaluate_poses(tmp_path / "out", table)
-    part = evaluate_poses(tmp_path / "out", table, start=3, stop=9)
+    whole = evaluate(import_poses(tmp_path / "out", table))
+    part = evaluate(import_poses(tmp_path / "out", table, start=3, stop=9))
     assert part.objects["can"].frame_index.tolist() == list(range(3, 9)) and part.objects["can"].lost == 2
     assert whole.objects["can"].lost == 3
     with pytest.raises(BadInput, match="0 <= start < stop within 12 frames"):
-        evaluate_poses(tmp_path / "out", table, start=9, stop=9)
+        import_poses(tmp_path / "out", table, start=9, stop=9)
 
 
 IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n"
