@@ -1086,6 +1086,12 @@ def test_what_is_suspicious_is_said_at_the_end_kept_and_said_again(sequence, tmp
     assert cli.main(["eval", str(out), "--json"]) == 0
     judged = json.loads(capsys.readouterr().out)["objects"]["wall"]
     assert judged["verdict"] == "look" and told["doubts"][0] in [found["text"] for found in judged["look_at"]]
+    both = clicks(tmp_path, ("wall", 0, [[5, 5], [150, 110]]), ("board", 0, [[64, 52]]))
+    out = tmp_path / "both"
+    assert run(sequence, out, *both) in (0, 2)
+    assert "p2p click" not in capsys.readouterr().out, "no masks were kept to be mended"
+    assert run(sequence, out, *both, "--force", "--save-masks") in (0, 2)
+    assert f"where a mask is wrong: p2p click {sequence} --run {out} --out" in capsys.readouterr().out
 
 
 BAD_CLICKS = {

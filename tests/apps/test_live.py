@@ -798,6 +798,25 @@ def test_lines_go_to_a_socket(kind, folder, tmp_path, capsys):
     assert capsys.readouterr().out == "" and {json.loads(line)["object"] for line in got} == {"board"}
 
 
+def test_what_a_folder_holds_cannot_be_gone_on_with(folder, tmp_path, capsys):
+    """As ``p2p run`` could: a camera's images are gone."""
+    prompts, out = save_prompts(tmp_path / "p.json", PROMPTS), tmp_path / "run"
+    words = [
+        "live",
+        "--camera",
+        f"folder:{folder}",
+        "--rate",
+        "100",
+        "--prompts",
+        str(prompts),
+        "--out",
+        str(out),
+        *WORDS,
+    ]
+    assert cli.main([*words, "--stop", "3"]) == 0 and cli.main(words) == 2
+    assert "--force" in (err := capsys.readouterr().err) and "--resume" not in err
+
+
 def test_a_reader_that_goes_away_ends_nothing(capsys):
     said = []
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -1,5 +1,7 @@
 """What moves with an object, on a made-up scene: a plate before a wall, a part of it, a neighbour that stays."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -210,6 +212,9 @@ def test_where_the_wall_was_seen_through_it_is_not_the_object():
     come[0][:, :200], come[1][:, :200] = _texture(4)[:, :200], np.where(empty, WALL_M, 0.9)[:, :200]
     crowded = Motions(now, both.recent, ((Frame(0, 0.0, *come), both.recent[1]),))
     assert free_before(patch, crowded)[part].mean() > 0.7
+    lines = now.depth_m.copy()  # without depth, where few points would lie
+    lines[::24] = 0
+    assert free_before(patch, replace(later, now=replace(now, depth_m=lines)))[part].mean() > 0.7
     turned = before.rgb[:, ::-1].copy(), before.depth_m[:, ::-1].copy()  # and from where the camera is no more
     elsewhere = Motions(now, both.recent, ((Frame(0, 0.0, *turned), both.recent[1]),))
     assert not free_before(patch, elsewhere).any()
