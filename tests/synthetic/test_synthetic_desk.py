@@ -44,7 +44,7 @@ def test_the_camera_is_fast_and_things_leave_and_return(seed):
     deg = np.degrees(se3.angle_rad(se3.inverse(T[:-1]) @ T[1:]))
     assert 1.5 < np.median(deg) < 3.5 and 3.5 < np.percentile(deg, 95) < 6 and deg.max() < 7.5
     labelled = [k for k, b in enumerate(scenario.bodies, 1) if b.labelled]
-    seen = [[np.count_nonzero(scenario.rendered(t).label == k) for k in labelled] for t in range(0, scenario.frames, 3)]
+    seen = [[np.count_nonzero(scenario.rendered(t).label == k) for k in labelled] for t in range(0, scenario.frames, 6)]
     there = np.array(seen) > 4  # 256 pixels of the whole image
     assert there[0].all()
     returns = (~there[:-1] & there[1:]).sum()

@@ -19,7 +19,7 @@ from p2p_lib.synthetic.resting import resting
 from tests.synthetic.surface_points import see
 
 SMALL = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
-SEEDS = (1, 2)
+SEEDS = (0, 1)  # a mug and a carton
 _made = {}
 
 
@@ -123,7 +123,7 @@ def test_poses_and_depth_agree_on_every_pixel_of_a_mask(name):
 
 
 def test_motion_blurs_the_thing_and_only_then():
-    scenario = film("in_hand", 2)  # its thing has a print
+    scenario = film("in_hand", 1)  # its thing has a print
     deg, px = steps(scenario)
     room = scenario.empty(0)
     sharp_sensor = Sensor(motion_blur=0.0)
