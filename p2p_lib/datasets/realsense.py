@@ -96,6 +96,8 @@ class RealSenseCamera:
         config.enable_stream(rs.stream.color, WIDTH, HEIGHT, rs.format.rgb8, RATE_HZ)
         config.enable_stream(rs.stream.depth, WIDTH, HEIGHT, rs.format.z16, RATE_HZ)
         try:
+            if not rs.context().query_devices():  # which start would wait for, 15 s
+                raise RuntimeError("no device connected")
             self._pipeline.start(config)
         except RuntimeError as error:
             fix = "Plug a depth camera into USB 3, and close the RealSense Viewer."
