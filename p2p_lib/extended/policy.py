@@ -15,7 +15,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import DOUBTED, Status
-from p2p_lib.extended.agreement import scene_ratio
+from p2p_lib.extended.agreement import looks_alike, scene_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
 from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge
@@ -247,12 +247,13 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         """The pose of a followed object, or another turn in its place under which clearly more of the surface shows.
 
         In a fast turn points slide over the surface, all alike, and agree on a pose that has stayed behind. That is
-        looked for where few keypoints agree; new points do not count, they agree with whatever placed them.
+        looked for where few keypoints agree; new points do not count, they agree with whatever placed them. Over what
+        looks as it did, none slides.
         """
         agree = np.count_nonzero(best.hypothesis.inliers & known.keypoints(obs))
         many = agree >= self.config.lifecycle.return_inliers
         due = not (many or known.life.unconfirmed or obs.mask is None)
-        if not (due and self.shape.knows(known) and "slips" in self.on):
+        if not (due and self.shape.knows(known) and "slips" in self.on) or self._looks_as_before(obs):
             return best
         assert best.refined is not None, "it is refined before it is compared"
         if may_slide(best.refined, self.config.refinement.min_eigenvalue, 2):
@@ -324,6 +325,14 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         """The newest frame without a doubt; None unless both it and this one have a mask."""
         before = self.trusted
         return None if obs.mask is None or before is None or before.mask is None else before
+
+    def _looks_as_before(self, obs: OurObservation) -> bool:
+        """Whether it looks as in the newest frame without a doubt, so that it has not turned since."""
+        before = self._before(obs)
+        if before is None:
+            return False
+        assert obs.mask is not None and before.mask is not None, "both have one"
+        return looks_alike(obs.frame, obs.mask, before.frame, before.mask)
 
     def _scene_ratio(self, obs: OurObservation) -> float:
         """How far away the resting scene is measured, over what it was in the newest frame without a doubt."""
