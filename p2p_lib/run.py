@@ -26,7 +26,7 @@ from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera
-from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size, uncounted
+from p2p_lib.datasets.depth_units import beyond, distance_m, hardly_counts, odd_size, uncounted
 from p2p_lib.datasets.exchange import as_run, export, pose_files, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import load_masks
@@ -280,8 +280,10 @@ def _doubt_camera(job: _Job) -> None:
         return  # said when the run comes to that frame, with the poses before it kept
     if text := moving_scale(pairs):
         doubt("depth", text, f"Is each image scaled separately? See p2p check {job.source}")
-    elif pairs and (found := misfit([frame for frame, _ in pairs])) and found.doubt:
-        doubt("depth", *found.doubt)
+        return
+    firsts = [first for first, _ in pairs]
+    if firsts and hardly_counts(firsts, job.config.depth, 1.0) is None and (found := misfit(firsts)) and found.doubt:
+        doubt("depth", *found.doubt)  # in another unit, which is said of objects, its edges are others
 
 
 def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None], known_m: Container[str]) -> set[str]:
