@@ -61,6 +61,7 @@ class RunResult:
     advice       what to do about objects that never had a pose, a line; "" where all had one
     tracked      whether any object ever had a pose
     look_at      what to look at before the run is believed, a line each; none where nothing that it keeps is suspicious
+    unstarted    objects that never had a mask to start from
     """
 
     path: Path
@@ -71,6 +72,7 @@ class RunResult:
     advice: str = ""
     tracked: bool = True
     look_at: tuple[str, ...] = ()
+    unstarted: tuple[str, ...] = ()
 
 
 def run(
@@ -455,10 +457,14 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
         of = f" of {', '.join(done.objects)}, only of {', '.join(job.sequence.truth)}" if job.sequence.truth else ""
         not_scored = f"the sequence has no truth{of or sequences.no_truth_said(job.sequence)}"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
-    advice = "" if interrupted else _advice(done, job)
+    without = {
+        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in done.objects.items() if not obj.has_pose.any()
+    }
+    unstarted = tuple(name for name, why in without.items() if why.startswith(NOT_SEEN) and name not in job.memories)
+    advice = "" if interrupted or not without else _advice(without, unstarted, job)
     look_at = [f"{name}: {text}" for name, of in (done.info.get("look_at") or {}).items() for text in of]
     lines = summary(done, len(job.frames))
-    return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked, tuple(look_at))
+    return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked, tuple(look_at), unstarted)
 
 
 #: Why an object that was followed has no pose in its frame.
@@ -486,21 +492,15 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _advice(run: Run, job: _Job) -> str:
-    """What to do about objects that never had a pose, by what kept it from them; "" where there are none."""
-    reasons = {
-        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in run.objects.items() if not obj.has_pose.any()
-    }
-    if not reasons:
-        return ""
-    why = " ".join(reasons.values())
+def _advice(reasons: Mapping[str, str], unstarted: Iterable[str], job: _Job) -> str:
+    """What to do about objects that never had a pose, by what kept it from them."""
     if set(reasons) <= set(job.memories):
         fix = "show a side that was learnt, or click on it, or it is not in this video"
-    elif "depth" in why:
+    elif any("depth" in why for name, why in reasons.items() if name not in unstarted):
         fix = "its depth is missing, out of range or in another unit (--depth-scale)"
-    elif NOT_SEEN in why and not job.masks.every_mask:
+    elif unstarted and not job.masks.every_mask:
         fix = "click on another place, near its centre"
-    elif NOT_SEEN in why:
+    elif unstarted:
         fix = "its masks are empty or too small: draw them anew, or use p2p click"
     else:
         fix = "look for faults in the data"

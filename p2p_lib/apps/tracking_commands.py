@@ -120,9 +120,11 @@ def _run(a: argparse.Namespace) -> int:
     elif a.out.is_dir():
         results += f"; not scored, {unscored(result.not_scored, a.out)}"
     if a.out.is_dir():
-        mend = f"; where a mask is wrong: p2p click {a.sequence} --run {a.out} --out prompts.json"
-        mend *= bool(result.look_at and options.save_masks)
-        print(f"{results}." + f" Next: p2p view {a.out}{mend}" * result.tracked)
+        following = [f"Next: p2p view {a.out}"] * result.tracked
+        if result.unstarted or (result.look_at and options.save_masks):
+            where = f" ({', '.join(result.unstarted)} never started)" if result.unstarted else ""
+            following.append(f"where a mask is wrong{where}: p2p click {a.sequence} --run {a.out} --out prompts.json")
+        print(f"{results}. {'; '.join(following)}".rstrip())
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:

@@ -19,6 +19,7 @@ import trimesh
 
 import p2p_lib
 from p2p_lib.apps import cli
+from p2p_lib.apps.click import Clicker
 from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -618,13 +619,29 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
     for path in (sequence / "masks").iterdir():
         cv2.imwrite(str(path), np.zeros((H, W), np.uint8))
     assert run(sequence, tmp_path / "empty") == 2
-    assert "its masks are empty or too small" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "its masks are empty or too small" in err
+    assert (
+        f" where a mask is wrong (object never started): p2p click {sequence} --run {tmp_path / 'empty'} --out" in out
+    )
     shutil.rmtree(sequence / "masks")
     assert run(sequence, tmp_path / "none") == 2
     assert "p2p click" in (line := one_line(capsys)) and "--prompts" in line
     prompts = clicks(tmp_path, ("object", 0, ON_BOARD))
     assert run(sequence, tmp_path / "none", *prompts, "--masks", "dataset") == 2
     assert one_line(capsys).endswith("Leave --masks out: the prompts start the objects.\n")
+
+
+def test_what_never_started_for_want_of_a_mask_is_clicked_on_anew(sequence, tmp_path, capsys):
+    """However much its doubts speak of depth; what follows works, whether masks were kept or not."""
+    few = ["--set", "lifecycle.min_mask_px=100000"]
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("wall", 0, [[5, 5], [150, 110]])), *few) == 2
+    out, err = capsys.readouterr()
+    assert "check that depth is in metres" in err and "click on another place" in err and "--depth-scale" not in err
+    again = shlex.split(out.partition("(wall never started): p2p ")[2])[:-1]
+    assert "p2p view" not in out and again == ["click", str(sequence), "--run", str(tmp_path / "out"), "--out"]
+    with Clicker(open_sequence(sequence), tmp_path / "new.json", run=load_run(tmp_path / "out")) as page:
+        assert [prompt.name for prompt in page.prompts] == ["wall"] and page.kept_masks(0) == {}
 
 
 def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
