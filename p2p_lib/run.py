@@ -20,7 +20,7 @@ from p2p_lib.core.errors import BadInput, Doubts, MissingData, P2PError, advised
 from p2p_lib.core.memory import ObjectMemory, far_fewer_pixels, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar, waiting_for
-from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.prompts import Prompt, given_masks
 from p2p_lib.core.types import DOUBTED, NOT_SEEN, WITH_POSE, Frame, PoseEstimate, status_text
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
@@ -434,12 +434,14 @@ def _estimates(
                     raise advised(unreadable, _NEEDED if i in job.prompts else SKIP_BAD) from None
                 leave_out(i, unreadable)
                 continue
-            for prompt in job.prompts.get(i, ()):
-                method.tell(prompt)
-            estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
-            for error in method.refused.values():  # nobody is there to say something better
+            given = {name: masks[name] for name in method.objects if name in masks}
+            prompts = {prompt.name: prompt for prompt in job.prompts.get(i, ())}
+            refused = given_masks(frame, given, prompts, method.objects, method.camera)[1] if prompts else {}
+            for error in refused.values():  # a step would ignore it; nobody is there to say something better
                 raise error
-            yield estimates
+            for prompt in prompts.values():
+                method.tell(prompt)
+            yield method.step(frame, given)
         yield from method.finish()
 
     for estimates in steps():

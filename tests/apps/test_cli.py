@@ -1136,10 +1136,11 @@ def test_bad_clicks_are_answered_in_one_line(case, sequence, tmp_path, capsys):
 
 
 def test_clicks_without_depth_are_answered_in_one_line(sequence, tmp_path, capsys):
-    path = sequence / "depth" / "0000.png"
-    cv2.imwrite(str(path), np.zeros((H, W), np.uint16))
-    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 0, ON_BOARD))) == 2
-    assert "clicks on 'object': got (45, 40) has no depth in frame 0" in one_line(capsys)
+    """Clicks that start an object, and those that correct it, which are not said to be ignored first."""
+    for prompts in [(("object", 2, ON_BOARD),), (("object", 0, ON_BOARD), ("object", 2, ON_BOARD))]:
+        cv2.imwrite(str(sequence / "depth" / "0002.png"), np.zeros((H, W), np.uint16))
+        assert run(sequence, tmp_path / f"{len(prompts)}", *clicks(tmp_path, *prompts)) == 2
+        assert "clicks on 'object': got (45, 40) has no depth in frame 2, expected" in one_line(capsys)
 
 
 def test_masks_that_were_not_kept_cannot_be_scored(done, capsys):
