@@ -647,11 +647,12 @@ def test_what_never_started_for_want_of_a_mask_is_clicked_on_anew(sequence, tmp_
 def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        "p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append((name, more[-1])) or out
+        "p2p_lib.synthetic.write_sequence",
+        lambda name, out, *more, **how: made.append((name, how["progress"], how["stop"])) or out,
     )
-    for more in ([], ["--quiet"]):
+    for more in ([], ["--quiet", "--stop", "5"]):
         assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path), *more]) == 0
-    assert made == [("crossing", True), ("crossing", False)], "what it is, and whether progress is shown"
+    assert made == [("crossing", True, None), ("crossing", False, 5)], "what it is, whether progress is shown, how much"
 
 
 def test_the_list_of_scenarios_has_no_markup(capsys):
