@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -28,6 +28,8 @@ _STANDS_M = (0.15, 5.0)
 _FAR_M = 2.5
 #: How long they are, m: a spatula and a keyboard have 0.4, what of a tin looks out behind another one 0.035.
 _LONG_M = (0.02, 0.8)
+#: Where less of what was measured than this share is at distances that count, the unit may be another.
+_USED_SHARE = 0.3
 #: Fraction of a mask that should have a depth.
 MEASURED_SHARE = 0.5
 
@@ -74,6 +76,18 @@ def uncounted(away_m: Mapping[str, float], limits: DepthConfig) -> bool:
     """Whether all objects are too far away, or all too near, for their depth to count."""
     distances = np.array(list(away_m.values()))
     return bool((distances > limits.max_m).all() or (distances < limits.min_m).all())
+
+
+def hardly_counts(frames: Iterable[Frame], limits: DepthConfig, scale: float) -> tuple[str, str] | None:
+    """What to say of depth of which hardly any is at distances that count, and what to do; None where enough is."""
+    every_m = np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
+    used = float(((every_m >= limits.min_m) & (every_m <= limits.max_m)).mean()) if len(every_m) else 1.0
+    if used >= _USED_SHARE:
+        return None
+    guess = likely_units(float(np.median(every_m)), scale)
+    fix = f"Is the unit right (--depth-scale)? {guess}." if guess else ""
+    text = f"{100 * used:.0f} % of these between {limits.min_m:g} and {limits.max_m:g} m, which count"
+    return text, f"{fix} What is farther away counts with --set depth.max_m=METRES.".strip()
 
 
 def odd_size(mask: np.ndarray, away_m: float, camera: Camera, scale: float) -> tuple[str, str] | None:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import warnings
+from collections import deque
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -40,6 +41,7 @@ from p2p_lib.datasets.prompts import run_lengths, save_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.known_size import Watch
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
@@ -411,6 +413,55 @@ def test_no_pose_is_null_and_the_line_is_strict_json():
         "T_world_obj": None,
     }
     assert "\n" not in line and "NaN" not in line
+
+
+def test_a_pose_of_too_little_confidence_is_null_and_says_so(folder, tmp_path, capsys, monkeypatch):
+    """The line comes all the same, with all that is known but where the object is."""
+    pose = {"T_cam_obj": np.eye(4), "covariance": np.eye(6), "T_world_obj": np.eye(4)}
+    doubted = PoseEstimate("mug", 3, 0.1, Status.TRACKED, confidence=0.5, reason="blurred", **pose)
+    whole, least = json.loads(json_line(doubted)), json.loads(json_line(doubted, 0.5))
+    assert all(whole[key] is not None and least[key] is None for key in pose)
+    said = "its pose is not told: confidence 0.50, not above 0.5; blurred"
+    assert least["reason"] == said and text_line(doubted, 0.5) == f"0.10 s  mug: tracked: {said}"
+    assert {key for key in whole if whole[key] != least[key]} == {*pose, "reason"}
+    assert json_line(doubted, 0.4) == json_line(doubted) and text_line(doubted, 0.4) == text_line(doubted)
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    live = ["live", "--camera", f"folder:{folder}", "--rate", "40", "--prompts", str(prompts), *WORDS]
+    monkeypatch.setattr("p2p_lib.apps.live.json_line", lambda estimate, least: f"{least}")
+    assert cli.main([*live, "--stop", "3", "--min-confidence", "0.7"]) == 0
+    assert set(capsys.readouterr().out.splitlines()) == {"0.7"}
+    assert cli.main([*live, "--min-confidence", "1"]) == 2
+    assert "min_confidence: got 1, expected at least 0 and below 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("cm", "said"), [(12, "board: .* 12 cm given: fits"), (3, "size of 'board': .* longer|hold more")]
+)
+def test_known_sizes_are_compared_with_what_a_camera_sees(cm, said, folder, tmp_path):
+    camera, heard = AtOnce(open_sequence(folder).camera, map(open_sequence(folder).frame, range(6))), []
+    options = RunOptions(settings=SETTINGS, sizes={"board": cm})
+    how = {"say": heard.append, "backlog": 10}
+    track_live(camera, PROMPTS, lambda estimate: None, options, out=tmp_path / "run", **how)
+    assert re.search(said, heard[-1]), heard
+    doubted = any("known to be" in text for text in load_run(tmp_path / "run").info["look_at"]["board"])
+    assert doubted == (cm == 3)
+    with pytest.raises(BadInput, match="size: got the name 'board'"):
+        track_live(camera, (Prompt("mug", 0, [[60, 50]]),), lambda estimate: None, options)
+
+
+def test_that_masks_are_too_long_is_said_soon_and_once():
+    camera, said = Camera.from_K(K, W, H), []
+    watch, mask = Watch({"mug": 0.05, "can": 0.3}, said.append), np.zeros((H, W), bool)
+    mask[40:60, 40:120] = True
+    for k in range(30):
+        assert not said
+        watch.add(picture(k), {"mug": mask, "can": mask, "lid": mask}, camera)
+    assert len(said) == 1 and said[0].startswith("size of 'mug': known to be 5 cm long"), "the can may show more yet"
+    for k in range(30, 60):
+        watch.add(picture(k), {"mug": mask, "can": None}, camera)
+    assert len(said) == 1
+    watch.end()
+    assert len(said) == 2 and said[1].startswith("can: ") and "fits" in said[1]
 
 
 def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeypatch):
@@ -914,6 +965,31 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
         capsys.readouterr()
         assert cli.main(["live", "--camera", f"odd_cameras:{name}", "--listen", *WORDS]) == 2
         assert said in capsys.readouterr().err
+
+
+def odd(scripted, sizes):
+    """A camera of somebody else's that gives images of these heights."""
+    for k, h in enumerate(sizes):
+        whole = picture(k)
+        scripted.hand.put(Frame(k, k / 30, whole.rgb[:h], whole.depth_m[:h]))
+    scripted.hand.put(None)
+    return cameras.OwnCamera("mine:Camera", scripted)
+
+
+def test_images_of_another_size_are_left_out_and_said(scripted, recwarn):
+    """All of them, however many others come between; not before one of the right size shows that it is no rule."""
+    camera = odd(scripted, [9, H, 9, 9, H, 9])
+    assert [frame.index for frame in iter(camera.read, None)] == [1, 4]
+    first = f"camera mine:Camera: image 0: {W}x9, not {W}x{H} (width x height) as its camera. It is left out."
+    assert len(recwarn) == 4 and str(recwarn[0].message) == first
+
+
+@pytest.mark.parametrize(("sizes", "count"), [([9] * 3, 3), ([9] * 40, 30), ([H, *[9] * 40], 30)])
+def test_a_camera_whose_images_all_have_another_size_ends_it(scripted, sizes, count, recwarn):
+    camera = odd(scripted, sizes)
+    with pytest.raises(BadInput, match=f"got {W}x9, expected {W}x{H} .* {count} in a row were: make its camera"):
+        deque(iter(camera.read, None), 0)
+    assert not len(recwarn), "of what ends it, it is not said that it is left out"
 
 
 def test_a_live_run_says_that_its_images_are_gone(scripted, folder, tmp_path, capsys):
