@@ -28,6 +28,8 @@ _STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 _TRIPLES = ((0.5 + np.arange(_PLANES) * _STEPS[:, None]) % 1 * _PLANE_POINTS).astype(int)
 #: A support plane holds at least this share of the pixels.
 _SUPPORTS = 0.2
+#: What ends within a patch may cover up to this share of its border by accident.
+AT_THE_BORDER = 0.02
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,10 @@ class Patch:
         edge = np.ones(self.shape, bool)
         edge[1:-1, 1:-1] = False
         return edge
+
+    def encloses(self, region: np.ndarray) -> bool:
+        """Whether a region (h, w) bool ends within the patch, rather than going on beyond it."""
+        return bool(region[self.border()].mean() <= AT_THE_BORDER)
 
     def points(self) -> np.ndarray:
         """(h, w, 3) in the camera's frame; 0 where nothing is measured."""
