@@ -43,6 +43,12 @@ def bounds(mask: np.ndarray, margin_px: int = 0) -> tuple[slice, slice]:
     return rows, columns
 
 
+def ends_px(mask: np.ndarray) -> np.ndarray:
+    """(2, 2) x, y of the first pixel of a mask's (H, W) bounding box, and of the first beyond it."""
+    rows, columns = bounds(mask)
+    return np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+
+
 def outline_px(mask: np.ndarray, beside_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, 2) each: the pixels along the outline of a mask's (H, W) largest part, and what is beside, inside and out.
 

@@ -12,7 +12,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.depth_edges import depth_step_m
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import ends_px
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
@@ -157,9 +157,7 @@ class Patch:
 
     def ends_px(self, region: np.ndarray) -> np.ndarray:
         """(2, 2) x, y of the first pixel of a region (h, w) bool in the image, and of the first beyond it."""
-        rows, columns = bounds(region)
-        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
-        return ends * self.cell_px + [self.box.left, self.box.top]
+        return ends_px(region) * self.cell_px + [self.box.left, self.box.top]
 
     def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
         """(h, w) bool: the cells that are nearer to ``one`` (h, w) bool than to ``other``, see :meth:`away`."""
