@@ -66,6 +66,15 @@ def outline_px(mask: np.ndarray, beside_px: float) -> tuple[np.ndarray, np.ndarr
     return uv_px, uv_px + inwards, uv_px - inwards
 
 
+def shares(part: np.ndarray, holds: np.ndarray, fewest: int) -> np.ndarray:
+    """(K,) of each part, whose number pixels have in ``part`` (N,) int, the share that holds (N,) bool.
+
+    Parts of fewer pixels than ``fewest``, at least 1, are left out.
+    """
+    count = np.bincount(part)
+    return (np.bincount(part, holds) / np.maximum(count, 1))[count >= fewest]
+
+
 def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
     """(H, W) bool: what any of some masks holds; None holds nothing."""
     return reduce(np.logical_or, (mask for mask in masks if mask is not None))  # its ufunc would copy all of them first

@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from p2p_lib.core.image import bounds, in_image, nearest_px, outline_px
+from p2p_lib.core.image import bounds, in_image, nearest_px, outline_px, shares
 from p2p_lib.core.types import SPARSE, Frame
 
 #: Pixels that changed by less in each of red, green and blue, in grey levels, look the same.
@@ -49,9 +49,7 @@ def looks_alike(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
     now, then = frame.rgb[box], before.rgb[box]
     v, u = np.nonzero(both[box] & _telling(then))
     tile = v * _TILES // now.shape[0] * _TILES + u * _TILES // now.shape[1]
-    count = np.bincount(tile, minlength=_TILES**2)
-    same = np.bincount(tile, _alike(now, then)[v, u], _TILES**2)
-    share = (same / np.maximum(count, 1))[count >= _TELLING]
+    share = shares(tile, _alike(now, then)[v, u], _TELLING)
     return len(share) > 0 and float(np.median(share)) >= _MOST_ALIKE
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth_edges import depth_step_m
+from p2p_lib.core.image import shares
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.patch import AT_THE_BORDER, Patch, dilated
 
@@ -140,10 +141,7 @@ def _scene_around(patch: Patch, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 def _camera_stayed(p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Frame) -> bool:
     """Whether points of the scene were at the same places of an earlier image, but for where people are."""
     v, u = np.moveaxis(camera.project(p_cam)[:, ::-1] / then.shape * _TILES, -1, 0).astype(int)
-    tile = v * _TILES + u
-    count = np.bincount(tile, minlength=_TILES**2)
-    same = np.bincount(tile, agrees(p_cam, rgb, camera, then, np.eye(4)), _TILES**2)
-    share = (same / np.maximum(count, 1))[count >= _FEWEST]
+    share = shares(v * _TILES + u, agrees(p_cam, rgb, camera, then, np.eye(4)), _FEWEST)
     return len(share) > 0 and float(np.quantile(share, 1 - _TILES_THAT_STAY)) > _TILE_STAYS
 
 
