@@ -14,7 +14,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import DOUBTED, Status
+from p2p_lib.core.types import DOUBTED, Frame, Status
 from p2p_lib.extended.agreement import looks_alike, scene_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
@@ -321,31 +321,26 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         near = same_place(place, best.T_cam_obj)
         return near or (None if empty(self.observer, obs.frame, place, known.map.p_obj) else False)
 
-    def _before(self, obs: OurObservation) -> OurObservation | None:
-        """The newest frame without a doubt; None unless both it and this one have a mask."""
+    def _now_and_before(self, obs: OurObservation) -> tuple[Frame, np.ndarray, Frame, np.ndarray] | None:
+        """This frame with its mask, and the newest one without a doubt with its own; None unless both have one."""
         before = self.trusted
-        return None if obs.mask is None or before is None or before.mask is None else before
+        if obs.mask is None or before is None or before.mask is None:
+            return None
+        return obs.frame, obs.mask, before.frame, before.mask
 
     def _looks_as_before(self, obs: OurObservation) -> bool:
         """Whether it looks as in the newest frame without a doubt, so that it has not turned since."""
-        before = self._before(obs)
-        if before is None:
-            return False
-        assert obs.mask is not None and before.mask is not None, "both have one"
-        return looks_alike(obs.frame, obs.mask, before.frame, before.mask)
+        views = self._now_and_before(obs)
+        return views is not None and looks_alike(*views)
 
     def _scene_ratio(self, obs: OurObservation) -> float:
         """How far away the resting scene is measured, over what it was in the newest frame without a doubt."""
-        before = self._before(obs)
-        if before is None:
-            return 1.0
-        assert obs.mask is not None and before.mask is not None, "both have one"
-        return scene_ratio(obs.frame, obs.mask, before.frame, before.mask)
+        views = self._now_and_before(obs)
+        return 1.0 if views is None else scene_ratio(*views)
 
     def outline(self, obs: OurObservation) -> float:
         """Share of the mask's outline along depth steps, relative to that in the newest frame without a doubt."""
-        before = self._before(obs)
-        then, now = None if before is None else before.outline_share, obs.outline_share
+        then, now = None if self.trusted is None else self.trusted.outline_share, obs.outline_share
         return 1.0 if then is None or now is None or then < _CLEAR_OUTLINE else now / then
 
     # -- admit and request ---------------------------------------------------------------------
