@@ -212,8 +212,8 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         best, reason = self._best(obs, known, candidates)
         if best is None:
             return None, reason
-        best = self._held(obs, known, best if best.refined else self.refine(obs, known, best))
-        return self._compared(obs, known, best), reason
+        best = self._without_slip(obs, known, best if best.refined else self.refine(obs, known, best))
+        return self._told_from_turns(obs, known, best), reason
 
     def _best(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
         """The candidate to go on with, and why."""
@@ -243,7 +243,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
-    def _held(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
+    def _without_slip(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a followed object, or another turn in its place under which clearly more of the surface shows.
 
         In a fast turn points slide over the surface, all alike, and agree on a pose that has stayed behind. That is
@@ -267,7 +267,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         turned = Proposal(Hypothesis(near.T_cam_obj, agrees, residual_m, "surface"))
         return replace(self.refine(obs, known, turned), sighting=near.share, slipped=True)
 
-    def _compared(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
+    def _told_from_turns(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
 
         Repeated now and then until the lead is telling. Where no other turn is known, the keypoints' agreement leads.
