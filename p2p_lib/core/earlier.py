@@ -1,4 +1,4 @@
-"""Prompts of an earlier frame: they hold for a later one where nothing has moved in and about what they select."""
+"""What prompts select in their frame, and whether it holds for a later one: where nothing has moved in and about it."""
 
 from __future__ import annotations
 

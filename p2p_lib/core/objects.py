@@ -280,7 +280,7 @@ class Objects(ABC, Generic[FollowedT]):
                      None where there was none
 
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
-        is no world of the user's. The first pose of an object whose mask is doubtful is doubted.
+        is no world of the user's. In the frame of a prompt that made a doubtful mask the object's pose is doubted.
         """
         name = estimate.object
         said = self._doubts.pop((name, frame.index), getattr(self.segmenter, "doubts", {}).get(name, ""))
