@@ -203,7 +203,7 @@ def export_run(
     run = load_run(folder)
     in_model = (frame or ("model" if format == "bop" else "object")) == "model"
     path = run.info.get("path")
-    sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
+    sequence = sequences.reopen(run.info) if path and Path(path).is_dir() else None
     frames = model_frames(run) if in_model else None
     confident = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
     return export(replace(run, objects=confident), out, format, frames, sequence)

@@ -497,6 +497,7 @@ def test_doubts_are_of_the_newest_prompts(monkeypatch):
         (LEFT, {"points_px": [[122, 112]]}, ""),
         (WALL, {"points_px": [[120, 110]]}, "farther from its mask than that is long. It starts anew there."),
         (LEFT, {"points_px": [[290, 220]]}, "check that depth is in metres."),
+        (LEFT, {"box_px": (250, 180, 310, 230)}, "check that depth is in metres."),
     ],
 )
 def test_a_correction_that_starts_anew_is_doubted(was, say, said):

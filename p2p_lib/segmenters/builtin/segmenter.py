@@ -181,10 +181,11 @@ class BuiltinSegmenter:
         _mark(was, had[1])
         if not cutter.prompt.starts:
             return Target(), cutter.correct(was) if was.any() else None
-        mends = was.any() and not cutter.leaves(was)
+        leaves = was.any() and cutter.leaves(was)
+        mends = was.any() and not leaves and cutter.prompt.box_px is None
         if not mends:
-            self._begun[cutter.prompt.name] = bool(was.any())
-        box, x = cutter.correct(was) if mends and cutter.prompt.box_px is None else cutter.start()
+            self._begun[cutter.prompt.name] = bool(leaves)
+        box, x = cutter.correct(was) if mends else cutter.start()
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             self.doubts[cutter.prompt.name] = doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
