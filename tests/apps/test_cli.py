@@ -310,7 +310,8 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert contents(out) == before
 
 
-def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys):
+def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys, here):
+    here()
     (shelf := tmp_path / "shelf").mkdir()
     shutil.move(sequence, shelf / "one")
     words = ["run", "--batch", str(shelf), "--out", str(tmp_path / "out"), "--jobs", "1", *POINTS_ALONE]

@@ -14,7 +14,6 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin import prompted
 from p2p_lib.segmenters.builtin import segmenter as built_in
 from p2p_lib.segmenters.builtin.patch import Box, Patch
@@ -202,9 +201,9 @@ def test_a_click_beside_the_edge_that_has_no_depth_is_not_on_the_wall():
     assert _measured(clicks, frame).tolist() == [[92, 110], [87, 110], [120.4, 110], [215, 200]]
 
 
-def test_one_click_on_an_objects_edge_without_depth_selects_the_object():
+def test_one_click_on_an_objects_edge_without_depth_selects_the_object(opening):
     """By a sensor's noise and shadows; around this pixel the wall alone is measured nearer by."""
-    video = open_sequence("synthetic/three_objects")
+    video = opening("three_objects", 1)
     frame, block = video.frame(0), video.masks(0)["block"]
     assert frame.depth_m[208, 601] == 0 and block[208, 601]
     follow = BuiltinSegmenter(video.camera, preset().segmentation)
