@@ -20,13 +20,13 @@ from p2p_lib.core.errors import BadInput, Doubts, MissingData, P2PError, advised
 from p2p_lib.core.memory import ObjectMemory, far_fewer_pixels, load_memories
 from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
 from p2p_lib.core.progress import progress_bar, waiting_for
-from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.prompts import Prompt, given_masks
 from p2p_lib.core.types import DOUBTED, NOT_SEEN, WITH_POSE, Frame, PoseEstimate, status_text
 from p2p_lib.core.voxels import check_device
 from p2p_lib.datasets import sequence as sequences
 from p2p_lib.datasets.alignment import misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera
-from p2p_lib.datasets.depth_units import beyond, distance_m, odd_size, uncounted
+from p2p_lib.datasets.depth_units import beyond, distance_m, hardly_counts, odd_size, uncounted
 from p2p_lib.datasets.exchange import as_run, export, pose_files, read_poses
 from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import load_masks
@@ -36,7 +36,7 @@ from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.known_size import in_masks_m
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.readings import doubt_reading
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
@@ -61,6 +61,7 @@ class RunResult:
     advice       what to do about objects that never had a pose, a line; "" where all had one
     tracked      whether any object ever had a pose
     look_at      what to look at before the run is believed, a line each; none where nothing that it keeps is suspicious
+    unstarted    objects that never had a mask to start from
     """
 
     path: Path
@@ -71,6 +72,7 @@ class RunResult:
     advice: str = ""
     tracked: bool = True
     look_at: tuple[str, ...] = ()
+    unstarted: tuple[str, ...] = ()
 
 
 def run(
@@ -166,7 +168,7 @@ def import_poses(
     sequence: str | Path | sequences.Sequence,
     models: Mapping[str, str | Path] | None = None,
     align: str = "first",
-    min_visible_px: int = 300,
+    min_visible_px: int = MIN_VISIBLE_PX,
     format: str | None = None,
     start: int = 0,
     stop: int | None = None,
@@ -201,7 +203,7 @@ def export_run(
     run = load_run(folder)
     in_model = (frame or ("model" if format == "bop" else "object")) == "model"
     path = run.info.get("path")
-    sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
+    sequence = sequences.reopen(run.info) if path and Path(path).is_dir() else None
     frames = model_frames(run) if in_model else None
     confident = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
     return export(replace(run, objects=confident), out, format, frames, sequence)
@@ -280,8 +282,10 @@ def _doubt_camera(job: _Job) -> None:
         return  # said when the run comes to that frame, with the poses before it kept
     if text := moving_scale(pairs):
         doubt("depth", text, f"Is each image scaled separately? See p2p check {job.source}")
-    elif pairs and (found := misfit([frame for frame, _ in pairs])) and found.doubt:
-        doubt("depth", *found.doubt)
+        return
+    firsts = [first for first, _ in pairs]
+    if firsts and hardly_counts(firsts, job.config.depth, 1.0) is None and (found := misfit(firsts)) and found.doubt:
+        doubt("depth", *found.doubt)  # in another unit, which is said of objects, its edges are others
 
 
 def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None], known_m: Container[str]) -> set[str]:
@@ -430,12 +434,14 @@ def _estimates(
                     raise advised(unreadable, _NEEDED if i in job.prompts else SKIP_BAD) from None
                 leave_out(i, unreadable)
                 continue
-            for prompt in job.prompts.get(i, ()):
-                method.tell(prompt)
-            estimates = method.step(frame, {name: masks[name] for name in method.objects if name in masks})
-            for error in method.refused.values():  # nobody is there to say something better
+            given = {name: masks[name] for name in method.objects if name in masks}
+            prompts = {prompt.name: prompt for prompt in job.prompts.get(i, ())}
+            refused = given_masks(frame, given, prompts, method.objects, method.camera)[1] if prompts else {}
+            for error in refused.values():  # a step would ignore it; nobody is there to say something better
                 raise error
-            yield estimates
+            for prompt in prompts.values():
+                method.tell(prompt)
+            yield method.step(frame, given)
         yield from method.finish()
 
     for estimates in steps():
@@ -453,10 +459,14 @@ def _result(job: _Job, out: Path, interrupted: bool) -> RunResult:
         of = f" of {', '.join(done.objects)}, only of {', '.join(job.sequence.truth)}" if job.sequence.truth else ""
         not_scored = f"the sequence has no truth{of or sequences.no_truth_said(job.sequence)}"
     tracked = any(obj.has_pose.any() for obj in done.objects.values())
-    advice = "" if interrupted else _advice(done, job)
+    without = {
+        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in done.objects.items() if not obj.has_pose.any()
+    }
+    unstarted = tuple(name for name, why in without.items() if why.startswith(NOT_SEEN) and name not in job.memories)
+    advice = "" if interrupted or not without else _advice(without, unstarted, job)
     look_at = [f"{name}: {text}" for name, of in (done.info.get("look_at") or {}).items() for text in of]
     lines = summary(done, len(job.frames))
-    return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked, tuple(look_at))
+    return RunResult(out, evaluation, not_scored, lines, interrupted, advice, tracked, tuple(look_at), unstarted)
 
 
 #: Why an object that was followed has no pose in its frame.
@@ -484,21 +494,15 @@ def summary(run: Run, wanted: int) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _advice(run: Run, job: _Job) -> str:
-    """What to do about objects that never had a pose, by what kept it from them; "" where there are none."""
-    reasons = {
-        name: Counter(obj.reason).most_common(1)[0][0] for name, obj in run.objects.items() if not obj.has_pose.any()
-    }
-    if not reasons:
-        return ""
-    why = " ".join(reasons.values())
+def _advice(reasons: Mapping[str, str], unstarted: Iterable[str], job: _Job) -> str:
+    """What to do about objects that never had a pose, by what kept it from them."""
     if set(reasons) <= set(job.memories):
         fix = "show a side that was learnt, or click on it, or it is not in this video"
-    elif "depth" in why:
+    elif any("depth" in why for name, why in reasons.items() if name not in unstarted):
         fix = "its depth is missing, out of range or in another unit (--depth-scale)"
-    elif NOT_SEEN in why and not job.masks.every_mask:
+    elif unstarted and not job.masks.every_mask:
         fix = "click on another place, near its centre"
-    elif NOT_SEEN in why:
+    elif unstarted:
         fix = "its masks are empty or too small: draw them anew, or use p2p click"
     else:
         fix = "look for faults in the data"

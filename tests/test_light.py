@@ -84,8 +84,8 @@ def light(code: str, folder: Path, *words: str, leave_out: str = "") -> subproce
     return subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def p2p(folder: Path, *words: object, before: str = "") -> str:
-    ran = light(before + COMMAND, folder, *words)
+def p2p(folder: Path, *words: object) -> str:
+    ran = light(COMMAND, folder, *words)
     assert ran.returncode == 0, ran.stderr[-2000:]
     return ran.stdout
 
@@ -155,17 +155,9 @@ def test_a_benchmark_is_run_and_its_tables_are_written(folder):
     assert r"\begin{tabular}" in (folder / "b/few-quick/table.tex").read_text()
 
 
-#: The first frames of a scenario: all take as long as everything else here.
-SHORT = """
-from functools import partial
-from p2p_lib.synthetic import SCENARIOS
-SCENARIOS["mug"] = partial(SCENARIOS["mug"], frames=12)
-"""
-
-
 def test_synthetic_sequences_are_rendered_and_played_as_a_camera(folder, monkeypatch):
     monkeypatch.setenv("P2P_CACHE", str(folder / "cache"))
-    assert "Written to mug" in p2p(folder, "synth", "mug", "--out", "mug", before=SHORT)
+    assert "Written to mug" in p2p(folder, "synth", "mug", "--out", "mug", "--stop", 12)
     assert "Nothing is wrong" in p2p(folder, "check", "mug")
     prompts = '{"objects": [{"name": "mug", "frame": 0, "points": [[320, 240]]}]}'
     (folder / "prompts.json").write_text(prompts)

@@ -127,7 +127,8 @@ def run_notebooks(
             (home / "notebooks" / path.name).with_suffix(suffix).unlink(missing_ok=True)
 
     takes = "" if only else f" (all of them take {PROFILES[profile]})"
-    say(f"{_counted(plans)}, profile {profile}, results in {_near(home)}{takes}")
+    images = f", images in {_near(figures)}" if figures.parent != home else ""
+    say(f"{_counted(plans)}, profile {profile}, results in {_near(home)}{images}{takes}")
     results: list[NotebookResult] = []
     kernels: list[Any] = []
     pool = ThreadPoolExecutor(jobs)

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Sequence as SequenceOf
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 from p2p_lib.apps.click import FirstMasks, check_depths, clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.config import Config, DepthConfig, preset
+from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, did_you_mean
 from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.options import lengths_m
@@ -31,7 +32,15 @@ from p2p_lib.datasets import first_masks as drawing
 from p2p_lib.datasets import images
 from p2p_lib.datasets.alignment import background_share, misfit, moving_scale
 from p2p_lib.datasets.camera_check import odd_camera, sees
-from p2p_lib.datasets.depth_units import MEASURED_SHARE, beyond, distance_m, likely_units, odd_size, uncounted
+from p2p_lib.datasets.depth_units import (
+    MEASURED_SHARE,
+    beyond,
+    distance_m,
+    hardly_counts,
+    likely_units,
+    odd_size,
+    uncounted,
+)
 from p2p_lib.datasets.image_sequence import INTRINSICS, paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
 from p2p_lib.datasets.mask_log import mask_length_m
@@ -46,8 +55,6 @@ from p2p_lib.method.sampling import choose, usable_region
 FRAMES = 12
 #: Ranges in metres of whatever is recorded in front of a depth camera.
 NEAREST_M, FARTHEST_M = 0.05, 20.0
-#: Where less of what was measured than this share is at distances that count, the unit may be another.
-_USED_SHARE = 0.3
 #: Frames per second that cameras have, and a gap as a multiple of the usual interval.
 RATES_HZ, GAP = (0.5, 500.0), 10.0
 #: Fraction of images that may equal the next one.
@@ -63,6 +70,8 @@ POSED = 3
 #: Fraction of depth at its largest value from which on it was cut off there.
 CLIPPED_SHARE = 0.1
 
+#: What is judged in metres, by how its findings are called.
+_BY_METRES = ("registration", ": mask", ": points")
 _KNOWN = "--size NAME=CM (the object's longest side)"
 #: What to put where something of a folder is missing.
 _PUT = {
@@ -97,21 +106,8 @@ def check_folder(
     except P2PError as error:
         own = isinstance(sequence, str | Path) and format in (None, "folder")
         return (_files(Path(str(sequence)).expanduser()) if own else []) or [_unreadable("files", error)]
-    sequence, frames, masks = opened, list[Frame](), list[Mapping[str, np.ndarray]]()
-    whole, wrong = _whole(sequence)
-    looked_at, faults = evenly(whole, FRAMES).tolist(), list[tuple[P2PError, str]]()
-    for i in looked_at:
-        try:
-            frames.append(sequence.frame(i))
-        except P2PError as error:
-            faults.append((error, f"{_REPLACE} {images.SKIP_BAD}"))
-            continue
-        masks.append({})
-        try:
-            masks[-1] = sequence.masks(i) or {}
-        except P2PError as error:
-            faults.append((error, ""))
-    wrong += _once(faults, len(looked_at))
+    sequence = opened
+    frames, masks, wrong = _looked_at(sequence)
     if not frames:
         return wrong
     with warnings.catch_warnings(record=True) as doubts:
@@ -130,35 +126,63 @@ def check_folder(
     sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects)
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
-    depth = _depth(frames, scale, None if firsts else config.depth)  # of objects it is told apart
     findings = [*wrong, Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]
     pairs = [(f, after) for f in frames if (after := _readable(sequence, f.index + 1)) is not None]
-    findings += [_times(sequence), _repeated(pairs), depth, _scale(pairs), _registered(frames, pairs)]
-    if depth.level is Level.WRONG:
-        return findings  # nothing that follows would mean anything
-    findings.append(_truth(sequence))
-    if not firsts:  # of prompts it is said already what is wrong with them
-        return findings if prompts else [*findings, _no_masks(sequence, any(masks), config)]
-    far = _beyond(firsts, config, scale)
-    if far is not None:
-        findings.append(far)
-        if far.level is Level.WRONG:
-            return findings  # what follows would only be its consequences
+    sized = [_size(name, m, *firsts[name], sequence.camera) for name, m in sizes_m.items() if name in firsts]
+    depth, unit = _depth(frames, scale), None
+    if depth.level is not Level.WRONG:
+        unit = _beyond(firsts, sized, config, scale) if firsts else _uncounted(depth, frames, config, scale)
+    in_doubt = [unit] if unit is not None else []
+    about_depth = [depth, *in_doubt] if firsts else in_doubt or [depth]
+    findings += [_times(sequence), _repeated(pairs), *about_depth, _scale(pairs)]
+    if about_depth[-1].level is Level.WRONG:
+        return findings  # what follows would only be its consequences
+    findings += [_registered(frames, pairs), _truth(sequence)]
+    if not firsts and not prompts:  # of prompts it is said already what is wrong with them
+        findings.append(_no_masks(sequence, any(masks), config))
     for name, (frame, mask) in firsts.items():
         if mask.sum() < config.lifecycle.min_mask_px:
             findings.append(_nothing_there(name, frame, mask, config))
             continue
         if name in sizes_m:
-            findings.append(_size(name, sizes_m[name], frame, mask, sequence.camera))
+            findings += [of for of in sized if of.name == f"{name}: size"]
         elif wrong_size := odd_size(mask, distance_m(frame, mask), sequence.camera, scale):
             findings.append(Finding(f"{name}: size", Level.LOOK, *wrong_size))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
-        findings += [_range(name, frame, mask, config, scale)] if far is None else []
+        if unit is None or np.isnan(distance_m(frame, mask)):
+            findings.append(_range(name, frame, mask, config, scale))
         warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
         findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in warned]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
         findings += _misspelt(name, firsts)
-    return findings
+    return findings if unit is None else _blamed(unit, findings)
+
+
+def _looked_at(sequence: Sequence) -> tuple[list[Frame], list[Mapping[str, np.ndarray]], list[Finding]]:
+    """Some frames with their masks, and what is wrong with files."""
+    frames, masks = list[Frame](), list[Mapping[str, np.ndarray]]()
+    whole, wrong = _whole(sequence)
+    looked_at, faults = evenly(whole, FRAMES).tolist(), list[tuple[P2PError, str]]()
+    for i in looked_at:
+        try:
+            frames.append(sequence.frame(i))
+        except P2PError as error:
+            faults.append((error, f"{_REPLACE} {images.SKIP_BAD}"))
+            continue
+        masks.append({})
+        try:
+            masks[-1] = sequence.masks(i) or {}
+        except P2PError as error:
+            faults.append((error, ""))
+    return frames, masks, [*wrong, *_once(faults, len(looked_at))]
+
+
+def _blamed(unit: Finding, findings: list[Finding]) -> list[Finding]:
+    """What is wrong by metres, where their unit is in doubt, is its consequence: the unit is to be mended first."""
+    follow = [f for f in findings if f.level is Level.WRONG and f.name.endswith(_BY_METRES)]
+    after = {id(f): replace(f, level=Level.LOOK, fix=f"If the unit is right ({unit.name}): {f.fix}") for f in follow}
+    first = {id(unit): replace(unit, level=Level.WRONG)} if follow else {}
+    return [(first | after).get(id(f), f) for f in findings]
 
 
 def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "", more: str = "") -> Finding:
@@ -321,8 +345,8 @@ def _repeated(pairs: list[tuple[Frame, Frame]]) -> Finding:
     return Finding("motion", Level.OK, "every image looked at differs from the next")
 
 
-def _depth(frames: list[Frame], scale: float, counts: DepthConfig | None) -> Finding:
-    """Whether depth is in metres once the scale is applied, and at distances that count, where it is asked."""
+def _depth(frames: list[Frame], scale: float) -> Finding:
+    """Whether depth is in metres once the scale is applied."""
     known = [frame.depth_m[frame.depth_m > 0] for frame in frames]
     share = float(np.mean([len(d) / f.depth_m.size for d, f in zip(known, frames)]))
     if not share:
@@ -339,16 +363,16 @@ def _depth(frames: list[Frame], scale: float, counts: DepthConfig | None) -> Fin
         fix = "Say what a unit is with --depth-scale or depth_scale.txt (millimetres: 0.001, metres: 1)."
         fix += f" {guess}." if (guess := likely_units(median_m, scale)) else ""
         return Finding("depth", Level.WRONG, f"{text}: the unit is another", fix)
-    used = 1.0 if counts is None else float(((every_m >= counts.min_m) & (every_m <= counts.max_m)).mean())
-    if counts is not None and used < _USED_SHARE:
-        text += f", {100 * used:.0f} % of these between {counts.min_m:g} and {counts.max_m:g} m, which count"
-        fix = f"Is the unit right (--depth-scale)? {guess}." if (guess := likely_units(median_m, scale)) else ""
-        fix = f"{fix} What is farther away counts with --set depth.max_m=METRES.".strip()
-        return Finding("depth", Level.LOOK, text, fix)
     if share < MEASURED_SHARE / 2:
         fix = "Keep the sensor's least distance, and out of the sun; glass, mirrors and black things have no depth."
         return Finding("depth", Level.LOOK, text, fix)
     return Finding("depth", Level.OK, text)
+
+
+def _uncounted(depth: Finding, frames: list[Frame], config: Config, scale: float) -> Finding | None:
+    """The finding on depth where hardly any is at distances that count: without objects, all that tells a unit."""
+    wrong = hardly_counts(frames, config.depth, scale)
+    return None if wrong is None else replace(depth, level=Level.LOOK, text=f"{depth.text}, {wrong[0]}", fix=wrong[1])
 
 
 def _registered(frames: list[Frame], pairs: list[tuple[Frame, Frame]]) -> Finding:
@@ -405,16 +429,17 @@ def _misspelt(name: str, firsts: FirstMasks) -> list[Finding]:
     return []
 
 
-def _beyond(firsts: FirstMasks, config: Config, scale: float) -> Finding | None:
-    """The one finding of objects that are all out of range, or far away."""
-    away_m = {name: distance_m(*first) for name, first in firsts.items()}
-    wrong = beyond(away_m, config.depth, scale)
-    if wrong is None:
+def _beyond(firsts: FirstMasks, sizes: Iterable[Finding], config: Config, scale: float) -> Finding | None:
+    """The one finding of objects that are all out of range, or far away; that they are is told by a size that fits."""
+    away_m = {name: m for name, first in firsts.items() if np.isfinite(m := distance_m(*first))}
+    if not away_m or (wrong := beyond(away_m, config.depth, scale)) is None:
         return None
-    (first, (frame, mask)), *_ = firsts.items()
-    text = f"{wrong[0]}; {int(mask.sum())} pixels in frame {frame.index}"
     level = Level.WRONG if uncounted(away_m, config.depth) else Level.LOOK
-    return Finding(f"{first}: depth", level, text, wrong[1])
+    if level is Level.LOOK and any(of.fine for of in sizes):
+        return None
+    name = next(iter(away_m))
+    frame, mask = firsts[name]
+    return Finding(f"{name}: depth", level, f"{wrong[0]}; {int(mask.sum())} pixels in frame {frame.index}", wrong[1])
 
 
 def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: float) -> Finding:
@@ -425,7 +450,7 @@ def _range(name: str, frame: Frame, mask: np.ndarray, config: Config, scale: flo
         text = f"only {100 * share:.0f} % of its pixels in frame {frame.index} have a depth"
         return Finding(f"{name}: depth", Level.WRONG if share < 0.1 else Level.LOOK, text, fix)
     text = f"{distance_m(frame, mask):.2f} m away, {int(mask.sum())} pixels in frame {frame.index}"
-    wrong = _beyond({name: (frame, mask)}, config, scale)  # one that is far away beside others is
+    wrong = _beyond({name: (frame, mask)}, (), config, scale)  # one that is far away beside others is
     return wrong if wrong is not None and wrong.level is Level.WRONG else Finding(f"{name}: depth", Level.OK, text)
 
 

@@ -33,7 +33,7 @@ def _click(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.datasets.sequence import open_sequence
 
-    sequence = open_sequence(a.sequence, a.format, a.depth_scale)
+    sequence = open_sequence(a.sequence, a.format, a.depth_scale, gaps=a.run is not None)  # which it left out
     shown = load_run(a.run) if a.run is not None else None
     if shown is not None and (of := shown.info["sequence"]) != sequence.name:
         warn(f"p2p click: {a.run} is a run of {of}, not of {sequence.name}: is it the right one?")
@@ -107,6 +107,7 @@ def _convert(a: argparse.Namespace) -> None:
         help="YCB models, for ycb_, in_hand and thin_ scenarios (default: procedural ones)",
     ),
     arg("--bop", action="store_true", help="write a BOP scene besides, in DIR/bop"),
+    run_options(stop="one past the last frame (default: all)"),
     QUIET,
 )
 def _synth(a: argparse.Namespace) -> None:
@@ -118,7 +119,8 @@ def _synth(a: argparse.Namespace) -> None:
         return
     if a.scenario is None or a.out is None:
         raise BadInput("synth", "no scenario or no --out", "SCENARIO --out DIR; p2p synth --list names the scenarios")
-    out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, a.models or "", a.bop, not a.quiet)
+    how = {"models": a.models or "", "bop": a.bop, "progress": not a.quiet, "stop": a.stop}
+    out = write_sequence(a.scenario.removeprefix(SYNTHETIC), a.out, a.seed, a.noise, **how)
     print(f"Written to {out}. Next: p2p run {out} --out RUN")
 
 

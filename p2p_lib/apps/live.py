@@ -10,7 +10,7 @@ import json
 import logging
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,12 +26,13 @@ from p2p_lib.core.backends import DEFAULT_SEGMENTER, SEGMENTERS
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.memory import load_memories
-from p2p_lib.core.options import RunOptions
+from p2p_lib.core.options import RunOptions, lengths_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets.cameras import DEFAULT_BACKLOG, LiveCamera, Newest, Stream
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.run_writer import IfExists, RunWriter
+from p2p_lib.evaluation.known_size import Watch
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import Film
 from p2p_lib.figures.scenes import draw_live
@@ -87,13 +88,13 @@ def track_live(
     prompts  clicks, boxes, masks; those of frame k start their object, or correct its mask, at the camera's k-th image,
              which is not dropped
     options  the method and its parameters; ``masks`` names the segmenter, ``stop`` the image before which it ends,
-             ``memory`` what is known of objects, which are looked for without prompts
+             ``memory`` what is known of objects, which are looked for without prompts, ``sizes`` how long they are
     first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
     out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
     overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
     backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
-    say      told what it waits for before the first image, and then where ``words`` come from
+    say      told what it waits for before the first image, then where ``words`` come from, and whether ``sizes`` fit
     words    says of objects what comes in meanwhile; there need be no prompts then
     page     shows every frame that was tracked
 
@@ -110,6 +111,8 @@ def track_live(
         raise BadInput("backlog", backlog, "how many images may wait, from 0")
     config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     memories = load_memories(options.memory or ())
+    named_so_far = {*memories, *(prompt.name for prompt in prompts)}
+    sizes_m = lengths_m(options.sizes, options.sizes or () if words else sorted(named_so_far))
     method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
     warm_up(say)
     recall(method, memories, options.frozen)
@@ -124,7 +127,12 @@ def track_live(
         if overlay is not None:
             listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
         if out is not None:
-            listeners.append(kept.enter_context(_kept(out, camera, method, options, every_prompt, memories, if_exists)))
+            run = _kept(out, camera, method, options, every_prompt, memories, if_exists, sizes_m)
+            listeners.append(kept.enter_context(run))
+        if sizes_m:
+            watch = Watch(sizes_m, say)
+            listeners.append(lambda frame, estimates: watch.add(frame, method.masks, method.camera))
+            kept.callback(watch.end)
 
         def tell(estimates: dict[str, PoseEstimate]) -> None:
             if (of := method.frame) is not None:
@@ -143,7 +151,7 @@ def track_live(
         while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
-            every_prompt += words.tell(method, frame.index) if words else []
+            every_prompt += words.tell(method, frame) if words else []
             tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)
@@ -216,6 +224,7 @@ def _kept(
     prompts: list[Prompt],
     memories: Iterable[str],
     if_exists: IfExists,
+    sizes_m: Mapping[str, float],
 ) -> Iterator[Listener]:
     """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
     sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
@@ -224,7 +233,7 @@ def _kept(
     how: dict[str, Any] = {"models": find_models(sequence), "if_exists": if_exists}
     writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, **how)
     writer.info |= described(method, options, prompts)
-    keeper, stopped = Keeper(writer, method, options.save_masks, prompts), None
+    keeper, stopped = Keeper(writer, method, options.save_masks, prompts, sizes_m), None
 
     def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
         writer.info["stop"] = frame.index + 1
@@ -256,31 +265,44 @@ def click_first(
         return wait_for_clicks(page, say, open_browser), image
 
 
-def text_line(estimate: PoseEstimate) -> str:
-    """An estimate as a line for people: time, object, status; its place in the camera's frame, or why it has none."""
+def text_line(estimate: PoseEstimate, least: float = -1.0) -> str:
+    """An estimate as a line for people: time, object, status; its place in the camera's frame, or why it has none.
+
+    least  what a pose has to be more confident than to be told
+    """
     head = f"{estimate.time_s:.2f} s  {estimate.object}: "
-    if estimate.T_cam_obj is None:
-        return head + status_text(estimate.status, estimate.reason)
+    if estimate.T_cam_obj is None or estimate.confidence <= least:
+        return head + status_text(estimate.status, _unsure(estimate, least))
     x, y, z = estimate.T_cam_obj[:3, 3]
     return f"{head}{estimate.status}  {x:.3f} {y:.3f} {z:.3f} m  confidence {estimate.confidence:.2f}"
 
 
-def json_line(estimate: PoseEstimate) -> str:
+def _unsure(estimate: PoseEstimate, least: float) -> str:
+    """The reason of an estimate, before it that its pose is not told."""
+    withheld = estimate.T_cam_obj is not None and estimate.confidence <= least
+    why = f"its pose is not told: confidence {estimate.confidence:.2f}, not above {least:g}" if withheld else ""
+    return "; ".join(filter(None, (why, estimate.reason)))
+
+
+def json_line(estimate: PoseEstimate, least: float = -1.0) -> str:
     """An estimate as a line of JSON, with time_s, frame, object, status, confidence, map_id and reason.
 
     ``T_cam_obj`` (4x4, metres) and ``covariance`` (6x6, [rotation rad, translation m] on the right) are null without
     a pose, ``T_world_obj`` as well where the camera does not say where it stands.
+
+    least  what a pose has to be more confident than to be told; else all three are null, and the reason says so
     """
+    told = estimate.confidence > least
     line = {
         "time_s": round(estimate.time_s, 6),
         "frame": estimate.frame_index,
         "object": estimate.object,
         "status": str(estimate.status),
         "confidence": round(estimate.confidence, 4),
-        "T_cam_obj": estimate.T_cam_obj,
+        "T_cam_obj": estimate.T_cam_obj if told else None,
         "map_id": estimate.map_id,
-        "covariance": estimate.covariance,
-        "reason": estimate.reason,
-        "T_world_obj": estimate.T_world_obj,
+        "covariance": estimate.covariance if told else None,
+        "reason": _unsure(estimate, least),
+        "T_world_obj": estimate.T_world_obj if told else None,
     }
     return json.dumps(line, allow_nan=False, default=np.ndarray.tolist)

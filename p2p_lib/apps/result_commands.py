@@ -25,10 +25,13 @@ _FILES = (
 )
 def _refine(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import OFFLINE
+    from p2p_lib.offline.compared import compared
     from p2p_lib.offline.refine import refine_run
 
     try:
         print("\n".join(refine_run(a.run, not a.quiet, a.force)))
+        title = "Causal -> offline, by some of the images (p2p eval takes more of them):"
+        print("\n".join([title, *(f"  {line}" for line in compared(a.run))]))
     except KeyboardInterrupt:
         then = f"Go on: p2p refine {quote(str(a.run))}; it keeps the objects that are finished."
         raise KeyboardInterrupt(then) from None

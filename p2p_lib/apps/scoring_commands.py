@@ -262,12 +262,15 @@ def _figures(a: argparse.Namespace) -> None:
 
     figures = study("paper_figures")
     drawn = figures.picked(names(a.only) or ())  # what does not fit is said before anything runs
-    out = a.out or benchmark_dir("full")
+    out, folder = a.out or benchmark_dir("full"), a.figures or figure_dir()
+    if not a.quiet:
+        elsewhere = "" if a.figures else "; --figures DIR: elsewhere"
+        warn(f"Pictures and their index go to {folder}, over those there{elsewhere}. Runs go to {out}.")
     (ran,) = run_benchmarks([figures.plan_for(drawn)], out, progress=not a.quiet)
     if ran.interrupted:
         raise KeyboardInterrupt
     # Drawn from the whole plan, which is what their notes name.
-    for saved in figures.draw_all(load_benchmark(figures.PLAN, out), a.figures or figure_dir(), drawn, a.poses):
+    for saved in figures.draw_all(load_benchmark(figures.PLAN, out), folder, drawn, a.poses):
         print(saved.path)
 
 

@@ -120,9 +120,11 @@ def _run(a: argparse.Namespace) -> int:
     elif a.out.is_dir():
         results += f"; not scored, {unscored(result.not_scored, a.out)}"
     if a.out.is_dir():
-        mend = f"; where a mask is wrong: p2p click {a.sequence} --run {a.out} --out prompts.json"
-        mend *= bool(result.look_at and options.save_masks)
-        print(f"{results}." + f" Next: p2p view {a.out}{mend}" * result.tracked)
+        following = [f"Next: p2p view {a.out}"] * result.tracked
+        if result.unstarted or (result.look_at and options.save_masks):
+            where = f" ({', '.join(result.unstarted)} never started)" if result.unstarted else ""
+            following.append(f"where a mask is wrong{where}: p2p click {a.sequence} --run {a.out} --out prompts.json")
+        print(f"{results}. {'; '.join(following)}".rstrip())
     if film is not None and not result.interrupted:
         print(f"Film in {film(a.out, a.overlay)}")
     if result.interrupted:
@@ -180,15 +182,22 @@ def _without_map(run: Path) -> list[str]:
         *METHOD,
         "memory",
         "frozen",
+        "sizes",
         prompts="clicks; without and without --memory, the first image is clicked on",
         masks="segmenter (default: builtin)",
         stop="end before the camera's J-th image (default: Ctrl-C)",
+    ),
+    arg(
+        "--min-confidence",
+        type=float,
+        metavar="C",
+        help="poses of no more confidence are null in the lines (0.5: all that are doubted; default: none)",
     ),
     arg("--to", metavar="URL", help="send the lines to tcp://HOST:PORT or udp://HOST:PORT, not to standard output"),
     arg(
         "--listen",
         action="store_true",
-        help="lines of JSON on standard input add, correct and remove objects; their frame is the next one",
+        help="lines of JSON on standard input add, correct and remove objects, in the next frame or the one they name",
     ),
     arg("--click", action="store_true", help="a page on the newest image adds, corrects and removes objects"),
     output("DIR", "folder that keeps the run, as p2p run does"),
@@ -205,10 +214,13 @@ def _live(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.cameras import open_camera
     from p2p_lib.datasets.prompts import load_prompts
     from p2p_lib.datasets.run_writer import look_into
+    from p2p_lib.offline.finished import check_confidence
 
     options, count, first = _asked(a), LiveCount(), None
     check_device(options.config().device)  # what does not fit is said before the camera starts
     segmenter_of(options)
+    check_confidence(a.min_confidence or 0.0)
+    lengths_m(options.sizes, options.sizes or ())
     _film_wanted(a.overlay)
     keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
     keep["say"] = warn
@@ -221,6 +233,8 @@ def _live(a: argparse.Namespace) -> None:
         if not (prompts or options.memory or a.listen or a.click):
             prompts, first = click_first(camera, warn, not a.no_browser)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
+        if a.min_confidence is not None:
+            line = partial(line, least=a.min_confidence)
         with ExitStack() as opened:
             send = opened.enter_context(outlet(a.to, warn)) if a.to else partial(print, flush=True)
             if a.listen or a.click:

@@ -54,10 +54,14 @@ class MissingBackend(P2PError, ImportError):
         super().__init__(_sentence(f"{name}: {missing}", fix), name=name)
 
 
-def wrong_size(name: str, shape: tuple[int, ...], wanted: tuple[int, int], like: str, fix: str = "") -> BadInput:
+class WrongSize(BadInput):
+    """An image of another size."""
+
+
+def wrong_size(name: str, shape: tuple[int, ...], wanted: tuple[int, int], like: str, fix: str = "") -> WrongSize:
     """An image (H, W) of another size than that which ``like`` has: sizes are said width first, as those of files."""
     got = "{1}x{0}".format(*shape) if len(shape) == 2 else f"shape {shape}"
-    return BadInput(name, got, f"{wanted[1]}x{wanted[0]} (width x height) as {like}", fix)
+    return WrongSize(name, got, f"{wanted[1]}x{wanted[0]} (width x height) as {like}", fix)
 
 
 def advised(error: P2PError, fix: str) -> P2PError:

@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, doubt
+from p2p_lib.core.errors import BadInput, WrongSize, advised, doubt, wrong_size
 from p2p_lib.core.plugins import check_part, find, is_place
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
@@ -26,6 +26,8 @@ from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
 DEFAULT_RATE_HZ = 30.0
 #: So many frames may wait: a search or a keyframe takes as long as some frames, and those after it make up for that.
 DEFAULT_BACKLOG = 4
+#: So many images of another size in a row are no slip.
+_ODD_IN_A_ROW = 30
 #: How long a camera that was closed may take to come back from ``read``, s.
 _PATIENCE_S = 3.0
 
@@ -112,18 +114,41 @@ class FolderCamera:
 class OwnCamera:
     """Somebody else's camera: what it gives is checked, and it is closed once, however often that is asked for.
 
-    Raises :class:`BadInput` for one that lacks something, or has no :class:`~p2p_lib.core.camera.Camera`.
+    Images of another size than its ``camera`` says are left out, with a warning. Raises :class:`BadInput` for one that
+    lacks something, or has no :class:`~p2p_lib.core.camera.Camera`.
     """
 
     def __init__(self, spec: str, own: LiveCamera):
         self._spec, self._own, self._closed, self._last = spec, own, False, -1
+        self._fits = False  # whether any image had the right size
         check_part("camera", own, {"camera": None, "read": (), "close": ()}, spec)
         if not isinstance(own.camera, Camera):
             raise BadInput(f"camera {spec}: camera", type(own.camera).__name__, "a p2p_lib.Camera")
         self.name, self.camera = own.name, own.camera
 
     def read(self) -> Frame | None:
-        """Its next frame; :class:`BadInput` for anything else, and for an index that is not above the last one."""
+        """Its next frame of the right size; :class:`BadInput` for anything else.
+
+        And where there is none: so many in a row, or all until its end, have another size.
+        """
+        odd: list[WrongSize] = []
+        while len(odd) < _ODD_IN_A_ROW:
+            try:
+                frame = self._next()
+            except WrongSize as error:
+                odd.append(error)
+                continue
+            if frame is None and odd and not self._fits:
+                break
+            for one in odd:
+                doubt(one.name, f"{one.got}, not {one.expected}", "It is left out.")
+            self._fits |= frame is not None
+            return frame
+        fix = f"{len(odd)} in a row were: make its camera, a p2p_lib.Camera, that of the images which it gives."
+        raise advised(odd[0], fix)
+
+    def _next(self) -> Frame | None:
+        """What it gives next; :class:`BadInput` for what is no frame, and an index that is not above the last one."""
         frame = self._own.read()
         if frame is not None and not isinstance(frame, Frame):
             raise BadInput(f"camera {self._spec}: read()", type(frame).__name__, "a p2p_lib.Frame, or None at the end")
@@ -132,6 +157,9 @@ class OwnCamera:
             fix = "Count the camera's own images from 0: those that were dropped leave gaps."
             raise BadInput(f"camera {self._spec}: read()", got, "an index that increases", fix)
         self._last = self._last if frame is None else frame.index
+        size = self.camera.height, self.camera.width
+        if frame is not None and frame.shape != size:
+            raise wrong_size(f"camera {self._spec}: image {frame.index}", frame.shape, size, "its camera")
         return frame
 
     def close(self) -> None:

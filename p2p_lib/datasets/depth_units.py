@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import ends_px
 from p2p_lib.core.types import Frame
 
 #: Metres per unit of depth images in the field, likeliest first, and whose they are.
@@ -28,6 +28,8 @@ _STANDS_M = (0.15, 5.0)
 _FAR_M = 2.5
 #: How long they are, m: a spatula and a keyboard have 0.4, what of a tin looks out behind another one 0.035.
 _LONG_M = (0.02, 0.8)
+#: Where less of what was measured than this share is at distances that count, the unit may be another.
+_USED_SHARE = 0.3
 #: Fraction of a mask that should have a depth.
 MEASURED_SHARE = 0.5
 
@@ -76,14 +78,24 @@ def uncounted(away_m: Mapping[str, float], limits: DepthConfig) -> bool:
     return bool((distances > limits.max_m).all() or (distances < limits.min_m).all())
 
 
+def hardly_counts(frames: Iterable[Frame], limits: DepthConfig, scale: float) -> tuple[str, str] | None:
+    """What to say of depth of which hardly any is at distances that count, and what to do; None where enough is."""
+    every_m = np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
+    used = float(((every_m >= limits.min_m) & (every_m <= limits.max_m)).mean()) if len(every_m) else 1.0
+    if used >= _USED_SHARE:
+        return None
+    guess = likely_units(float(np.median(every_m)), scale)
+    fix = f"Is the unit right (--depth-scale)? {guess}." if guess else ""
+    text = f"{100 * used:.0f} % of these between {limits.min_m:g} and {limits.max_m:g} m, which count"
+    return text, f"{fix} What is farther away counts with --set depth.max_m=METRES.".strip()
+
+
 def odd_size(mask: np.ndarray, away_m: float, camera: Camera, scale: float) -> tuple[str, str] | None:
     """What to say of an object so long, or so short, as nothing is that is tracked, and what to do; NaN: not measured.
 
     mask  (H, W) bool: how long it is follows from its outline, at the distance away_m: depth is wild at edges
     """
-    rows, columns = bounds(mask)
-    sides_px = np.array([columns.stop - columns.start, rows.stop - rows.start])
-    length_m = float((sides_px / [camera.fx, camera.fy]).max() * away_m)
+    length_m = float((np.ptp(ends_px(mask), 0) / [camera.fx, camera.fy]).max() * away_m)
     if not (length_m < _LONG_M[0] or length_m > _LONG_M[1]):
         return None
     fix = f"If it is not, its mask is of something else, or {_wrong_scale(away_m, scale)}"

@@ -5,14 +5,16 @@ Both agree with themselves: everything is longer or shorter by one factor, poses
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from p2p_lib.core.camera import Camera
 from p2p_lib.core.mesh import oriented_box
-from p2p_lib.datasets.mask_log import load_masks
+from p2p_lib.core.types import Frame
+from p2p_lib.datasets.mask_log import load_masks, mask_length_m
 
 #: What is longer than known by more than this factor and this slack, m, is not the object as it is, nor what is always
 #: so much shorter: a part of it may be hidden, or seen end-on. Surfaces of well tracked objects are 1 cm too long.
@@ -24,6 +26,8 @@ _POINTS, _SHREDS = 4000, 0.01
 #: By such a factor everything is longer than known where the length was given in metres for centimetres.
 _IN_METRES = 80, 125
 _MASKS = "in its masks"
+#: After so many masks that were measured it is said that they are too long.
+_SOON = 30
 #: A mask shows the whole object at least so often.
 _OFTEN = 0.9
 
@@ -95,6 +99,41 @@ def lengths(folder: str | Path, known_m: Mapping[str, float]) -> dict[str, Lengt
         mask_m = in_masks_m(masks[name].size_m) if name in masks else float("nan")
         found[name] = Lengths(length_m, mask_m, *mesh_length_m(Path(folder) / "meshes" / f"{name}.ply"))
     return found
+
+
+class Watch:
+    """Compares what masks hold with how long objects are known to be, m, while they are tracked; to be told frames.
+
+    say  told once of each object, in a line, that it does not fit: that it is too long soon, the rest at the end
+    """
+
+    def __init__(self, known_m: Mapping[str, float], say: Callable[[str], object]):
+        self._known_m, self._say = known_m, say
+        self._measured_m: dict[str, list[float]] = {name: [] for name in known_m}
+        self._doubted: set[str] = set()
+
+    def add(self, frame: Frame, masks: Mapping[str, np.ndarray | None], camera: Camera) -> None:
+        """One more frame, with the objects' masks (H, W) bool in it."""
+        for name, measured_m in self._measured_m.items():
+            if (mask := masks.get(name)) is None or not np.isfinite(m := mask_length_m(frame, mask, camera)):
+                continue
+            measured_m.append(m)
+            if len(measured_m) % _SOON == 0 and in_masks_m(np.array(measured_m)) > self._known_m[name]:
+                self._judge(name)
+
+    def end(self) -> None:
+        """Say of each object whether it fits, where that is not said."""
+        for name in self._known_m:
+            if of := self._judge(name):
+                self._say(f"{name}: {of}")
+
+    def _judge(self, name: str) -> str:
+        """That an object fits, in words; else that it does not is said, once."""
+        of = Lengths(self._known_m[name], in_masks_m(np.array(self._measured_m[name])))
+        if of.doubt and name not in self._doubted:
+            self._doubted.add(name)
+            self._say(f"size of {name!r}: {of.doubt}")
+        return of.fit
 
 
 def that_fit(measured: Mapping[str, Lengths]) -> list[str]:

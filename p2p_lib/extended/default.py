@@ -19,6 +19,7 @@ from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.memory import ObjectMemory
+from p2p_lib.core.types import Frame
 from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
@@ -133,6 +134,7 @@ class Point2Pose(Savable):
         negative: ArrayLike | None = None,
         box: ArrayLike | None = None,
         *,
+        frame: Frame | None = None,
         memory: ObjectMemory | None = None,
         frozen: bool = False,
     ) -> None:
@@ -147,9 +149,9 @@ class Point2Pose(Savable):
         if memory is None:
             if frozen:
                 raise BadInput("add_object", "frozen without a memory", "a memory, whose map is then kept as it is")
-            super().add_object(name, mask, clicks, negative, box)
+            super().add_object(name, mask, clicks, negative, box, frame=frame)
             return
-        alone = mask is clicks is negative is box is None
+        alone = mask is clicks is negative is box is frame is None
         if not alone or file_name("object name", name) in self.objects:
             got = f"{name!r}, which is in use" if alone else "clicks or a mask, too"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")

@@ -72,9 +72,18 @@ def scenario_dir(name: str, seed: int = 0, *, progress: bool = True, **overrides
 
 
 def write_scenario(
-    folder: Path, scenario: Scenario, sensor: Sensor, seed: int, title: str = "rendering", progress: bool = False
+    folder: Path,
+    scenario: Scenario,
+    sensor: Sensor,
+    seed: int,
+    title: str = "rendering",
+    progress: bool = False,
+    stop: int | None = None,
 ) -> None:
-    """Renders a scenario into ``folder``, which is made: colour, depth, and the truth per labelled body."""
+    """Renders a scenario into ``folder``, which is made: colour, depth, and the truth per labelled body.
+
+    stop  one past the last frame; those before it are as they are in the whole film
+    """
     labelled = {k: body for k, body in enumerate(scenario.bodies, 1) if body.labelled}
     for name in ("rgb", "depth", *(f"{kind}/{body.name}" for kind in _PER_OBJECT for body in labelled.values())):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -82,6 +91,7 @@ def write_scenario(
     work = partial(_write_frame, folder, scenario, sensor, seed, scenario.empty(0) if still else None)
     with ThreadPoolExecutor(min(8, len(os.sched_getaffinity(0)))) as pool:
         frames = kept_frames(scenario.frames, sensor, np.random.default_rng([seed, 5]))
+        frames = frames[frames < (scenario.frames if stop is None else stop)]
         done = pool.map(work, frames.tolist())
         visible = list(progress_bar(title, len(frames), shown=progress, iterable=done, leave=False))
     np.savetxt(folder / "cam_K.txt", scenario.camera.K, fmt="%.6f")
@@ -107,12 +117,14 @@ def write_sequence(
     models: str | Path = "",
     bop: bool = False,
     progress: bool = False,
+    stop: int | None = None,
 ) -> Path:
     """What ``p2p synth`` does: a scenario as a YCBMultiTrack folder ``out``, which must not hold anything yet.
 
     noise   a key of :data:`~p2p_lib.synthetic.noise.NOISE`
     models  a folder of YCB models, for the scenarios that take them
     bop     writes the BOP scene ``out/bop/test/000001`` and its models besides
+    stop    one past the last frame
 
     ``scenario.json`` says what it is made of. Raises :class:`BadInput` for what does not fit.
     """
@@ -120,10 +132,13 @@ def write_sequence(
     own, _ = _settings(name, seed, {"models": str(models)} if models else {})
     if noise not in NOISE:
         raise BadInput("noise", repr(noise), "one of " + ", ".join(NOISE))
+    if stop is not None and stop < 1:
+        raise BadInput("stop", stop, "one past the last frame, from 1")
     check_new(out)
     scenario = SCENARIOS[name](seed, **own)
-    write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}", progress)
+    write_scenario(out, scenario, NOISE[noise], seed, f"rendering {name}", progress, stop)
     made = {"name": name, "seed": seed, "noise": noise, "sensor": asdict(NOISE[noise]), "objects": scenario.objects}
+    made |= {} if stop is None else {"stop": stop}
     (out / _DONE).write_text(json.dumps(made | {"generator": generator_version()}, indent=1, sort_keys=True) + "\n")
     if bop:
         ids = write_scene(out / "bop/test/000001", open_sequence(out, format="ycbmultitrack"))

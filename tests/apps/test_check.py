@@ -19,7 +19,7 @@ from p2p_lib.core.findings import Level, as_lines
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
-from p2p_lib.datasets.alignment import background_share, misfit
+from p2p_lib.datasets.alignment import Misfit, background_share, misfit
 from p2p_lib.datasets.image_sequence import WRITE_K
 from p2p_lib.datasets.images import SKIP_BAD, read_rgb
 from p2p_lib.datasets.mask_log import mask_length_m
@@ -377,8 +377,47 @@ def test_objects_all_out_of_range_or_far_are_one_finding(good, tmp_path, factor,
     found = alarms(check_folder(scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)))
     (wrong,) = (finding for finding in found if finding.name.endswith(": depth"))
     assert wrong.name == "box: depth" and "(can " in wrong.text
-    assert wrong.level is (Level.LOOK if factor == 5 else Level.WRONG) and (factor == 5 or found == [wrong])
-    assert limit in wrong.fix and scale in wrong.fix
+    assert wrong.level is Level.WRONG and limit in wrong.fix and scale in wrong.fix
+    rest = [finding for finding in found if finding is not wrong]
+    assert bool(rest) == (factor == 5), "out of range, nothing else is said"
+    assert {finding.level for finding in rest} <= {Level.LOOK}, "what is far is a mask's rim, too: by the same unit"
+
+
+@pytest.mark.parametrize("away", [1, 5])
+def test_what_is_wrong_by_metres_follows_from_a_unit_in_doubt(good, tmp_path, away):
+    """Masks that are drawn too wide are wrong; not where all is so far away that the unit may be another."""
+    scaled = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), away)
+    findings = check_folder(Faulty(open_sequence(scaled), "mask wide", 6))
+    wrong = [f.name for f in findings if f.level is Level.WRONG]
+    if away == 1:
+        assert {"box: mask", "can: mask"} & set(wrong)
+        return
+    assert wrong == ["box: depth"]
+    for after in (f for f in findings if f.name.endswith(": mask")):
+        assert after.level is Level.LOOK and after.fix.startswith("If the unit is right (box: depth): Draw it")
+    names = [f.name for f in findings]
+    assert names.index("box: depth") < names.index("registration"), "in the order in which it should be mended"
+
+
+def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch, recwarn):
+    """What is an edge of depth is in metres; a size that fits says that all is as far as it looks."""
+    monkeypatch.setattr(check, "misfit", lambda *_: Misfit(1.0, 20.0, 0.0, 1.5))
+    far = scaled_depth(shutil.copytree(good, tmp_path / "far"), 5)
+    assert [(f.name, f.level) for f in alarms(check_folder(good))] == [("registration", Level.WRONG)]
+    levels = {f.name: f.level for f in check_folder(far)}
+    assert (levels["box: depth"], levels["registration"]) == (Level.WRONG, Level.LOOK)
+    shutil.rmtree(scaled_depth(far, 4) / "masks")
+    levels = {f.name: f.level for f in check_folder(far)}
+    assert (levels["depth"], levels["registration"]) == (Level.WRONG, Level.LOOK)
+    sized = scaled_depth(shutil.copytree(good, tmp_path / "sized"), 5)
+    levels = {f.name: f.level for f in check_folder(sized, sizes={"box": 84})}
+    assert (levels["box: depth"], levels["registration"]) == (Level.OK, Level.WRONG)
+    assert found(sized, "box: depth", sizes={"box": 17}).level is Level.WRONG, "one that does not fit tells nothing"
+    monkeypatch.setattr("p2p_lib.run.misfit", lambda *_: Misfit(1.0, 20.0, 0.0, 1.5))
+    for folder, blamed in ((good, True), (scaled_depth(sized, 4), False)):
+        run(folder, tmp_path / "run", stop=2, if_exists="replace", progress=False)
+        assert any("offset from colour" in str(doubt.message) for doubt in recwarn) == blamed
+        recwarn.clear()
 
 
 @pytest.mark.parametrize("times", [1, 10])

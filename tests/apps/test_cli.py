@@ -19,6 +19,7 @@ import trimesh
 
 import p2p_lib
 from p2p_lib.apps import cli
+from p2p_lib.apps.click import Clicker
 from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -449,7 +450,7 @@ def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence,
     assert re.match(said, json.loads((tmp_path / "out/run.json").read_text())["doubts"][0])
 
 
-def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys):
+def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys, monkeypatch):
     (sequence / "depth/0002.png").unlink()
     assert run(sequence, tmp_path / "run") == 2
     assert "0002.png is missing. p2p run --skip-bad goes on" in capsys.readouterr().err
@@ -466,6 +467,12 @@ def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(seque
     assert list(kept.info["left_out"]) == ["2"] and "0002.png" in kept.info["left_out"]["2"]
     assert cli.main(["eval", str(tmp_path / "run")]) == 0
     assert cli.main(["film", str(tmp_path / "run"), "--out", str(tmp_path / "film.webp")]) == 0
+    assert cli.main(["export", str(tmp_path / "run"), "--format", "tum", "--out", str(tmp_path / "tum")]) == 0
+    assert len(np.loadtxt(tmp_path / "tum/object.txt")) == 7
+    monkeypatch.setattr("p2p_lib.apps.click.wait_for_clicks", lambda page, *_: page.prompts)
+    click = ["click", str(sequence), "--out", str(tmp_path / "prompts.json")]
+    assert cli.main([*click, "--run", str(tmp_path / "run")]) == 0, "what the run left out, it can be corrected without"
+    assert cli.main(click) == 2
     assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks", "--resume") == 0
 
 
@@ -619,7 +626,11 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
     for path in (sequence / "masks").iterdir():
         cv2.imwrite(str(path), np.zeros((H, W), np.uint8))
     assert run(sequence, tmp_path / "empty") == 2
-    assert "its masks are empty or too small" in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "its masks are empty or too small" in err
+    assert (
+        f" where a mask is wrong (object never started): p2p click {sequence} --run {tmp_path / 'empty'} --out" in out
+    )
     shutil.rmtree(sequence / "masks")
     assert run(sequence, tmp_path / "none") == 2
     assert "p2p click" in (line := one_line(capsys)) and "--prompts" in line
@@ -628,14 +639,27 @@ def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys
     assert one_line(capsys).endswith("Leave --masks out: the prompts start the objects.\n")
 
 
+def test_what_never_started_for_want_of_a_mask_is_clicked_on_anew(sequence, tmp_path, capsys):
+    """However much its doubts speak of depth; what follows works, whether masks were kept or not."""
+    few = ["--set", "lifecycle.min_mask_px=100000"]
+    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("wall", 0, [[5, 5], [150, 110]])), *few) == 2
+    out, err = capsys.readouterr()
+    assert "check that depth is in metres" in err and "click on another place" in err and "--depth-scale" not in err
+    again = shlex.split(out.partition("(wall never started): p2p ")[2])[:-1]
+    assert "p2p view" not in out and again == ["click", str(sequence), "--run", str(tmp_path / "out"), "--out"]
+    with Clicker(open_sequence(sequence), tmp_path / "new.json", run=load_run(tmp_path / "out")) as page:
+        assert [prompt.name for prompt in page.prompts] == ["wall"] and page.kept_masks(0) == {}
+
+
 def test_a_scenario_is_known_by_the_name_that_run_takes(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        "p2p_lib.synthetic.write_sequence", lambda name, out, *more: made.append((name, more[-1])) or out
+        "p2p_lib.synthetic.write_sequence",
+        lambda name, out, *more, **how: made.append((name, how["progress"], how["stop"])) or out,
     )
-    for more in ([], ["--quiet"]):
+    for more in ([], ["--quiet", "--stop", "5"]):
         assert cli.main(["synth", "synthetic/crossing", "--out", str(tmp_path), *more]) == 0
-    assert made == [("crossing", True), ("crossing", False)], "what it is, and whether progress is shown"
+    assert made == [("crossing", True, None), ("crossing", False, 5)], "what it is, whether progress is shown, how much"
 
 
 def test_the_list_of_scenarios_has_no_markup(capsys):
@@ -1120,10 +1144,11 @@ def test_bad_clicks_are_answered_in_one_line(case, sequence, tmp_path, capsys):
 
 
 def test_clicks_without_depth_are_answered_in_one_line(sequence, tmp_path, capsys):
-    path = sequence / "depth" / "0000.png"
-    cv2.imwrite(str(path), np.zeros((H, W), np.uint16))
-    assert run(sequence, tmp_path / "out", *clicks(tmp_path, ("object", 0, ON_BOARD))) == 2
-    assert "clicks on 'object': got (45, 40) has no depth in frame 0" in one_line(capsys)
+    """Clicks that start an object, and those that correct it, which are not said to be ignored first."""
+    for prompts in [(("object", 2, ON_BOARD),), (("object", 0, ON_BOARD), ("object", 2, ON_BOARD))]:
+        cv2.imwrite(str(sequence / "depth" / "0002.png"), np.zeros((H, W), np.uint16))
+        assert run(sequence, tmp_path / f"{len(prompts)}", *clicks(tmp_path, *prompts)) == 2
+        assert "clicks on 'object': got (45, 40) has no depth in frame 2, expected" in one_line(capsys)
 
 
 def test_masks_that_were_not_kept_cannot_be_scored(done, capsys):

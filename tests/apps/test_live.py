@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import warnings
+from collections import deque
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -24,7 +25,7 @@ import trimesh
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_click import LiveClicker
-from p2p_lib.apps.live_words import Words, outlet
+from p2p_lib.apps.live_words import KEPT, Words, outlet
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import preset
@@ -40,6 +41,7 @@ from p2p_lib.datasets.prompts import run_lengths, save_prompts
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.known_size import Watch
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
 from p2p_lib.run import run
@@ -413,6 +415,55 @@ def test_no_pose_is_null_and_the_line_is_strict_json():
     assert "\n" not in line and "NaN" not in line
 
 
+def test_a_pose_of_too_little_confidence_is_null_and_says_so(folder, tmp_path, capsys, monkeypatch):
+    """The line comes all the same, with all that is known but where the object is."""
+    pose = {"T_cam_obj": np.eye(4), "covariance": np.eye(6), "T_world_obj": np.eye(4)}
+    doubted = PoseEstimate("mug", 3, 0.1, Status.TRACKED, confidence=0.5, reason="blurred", **pose)
+    whole, least = json.loads(json_line(doubted)), json.loads(json_line(doubted, 0.5))
+    assert all(whole[key] is not None and least[key] is None for key in pose)
+    said = "its pose is not told: confidence 0.50, not above 0.5; blurred"
+    assert least["reason"] == said and text_line(doubted, 0.5) == f"0.10 s  mug: tracked: {said}"
+    assert {key for key in whole if whole[key] != least[key]} == {*pose, "reason"}
+    assert json_line(doubted, 0.4) == json_line(doubted) and text_line(doubted, 0.4) == text_line(doubted)
+    prompts = save_prompts(tmp_path / "p.json", PROMPTS)
+    live = ["live", "--camera", f"folder:{folder}", "--rate", "40", "--prompts", str(prompts), *WORDS]
+    monkeypatch.setattr("p2p_lib.apps.live.json_line", lambda estimate, least: f"{least}")
+    assert cli.main([*live, "--stop", "3", "--min-confidence", "0.7"]) == 0
+    assert set(capsys.readouterr().out.splitlines()) == {"0.7"}
+    assert cli.main([*live, "--min-confidence", "1"]) == 2
+    assert "min_confidence: got 1, expected at least 0 and below 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("cm", "said"), [(12, "board: .* 12 cm given: fits"), (3, "size of 'board': .* longer|hold more")]
+)
+def test_known_sizes_are_compared_with_what_a_camera_sees(cm, said, folder, tmp_path):
+    camera, heard = AtOnce(open_sequence(folder).camera, map(open_sequence(folder).frame, range(6))), []
+    options = RunOptions(settings=SETTINGS, sizes={"board": cm})
+    how = {"say": heard.append, "backlog": 10}
+    track_live(camera, PROMPTS, lambda estimate: None, options, out=tmp_path / "run", **how)
+    assert re.search(said, heard[-1]), heard
+    doubted = any("known to be" in text for text in load_run(tmp_path / "run").info["look_at"]["board"])
+    assert doubted == (cm == 3)
+    with pytest.raises(BadInput, match="size: got the name 'board'"):
+        track_live(camera, (Prompt("mug", 0, [[60, 50]]),), lambda estimate: None, options)
+
+
+def test_that_masks_are_too_long_is_said_soon_and_once():
+    camera, said = Camera.from_K(K, W, H), []
+    watch, mask = Watch({"mug": 0.05, "can": 0.3}, said.append), np.zeros((H, W), bool)
+    mask[40:60, 40:120] = True
+    for k in range(30):
+        assert not said
+        watch.add(picture(k), {"mug": mask, "can": mask, "lid": mask}, camera)
+    assert len(said) == 1 and said[0].startswith("size of 'mug': known to be 5 cm long"), "the can may show more yet"
+    for k in range(30, 60):
+        watch.add(picture(k), {"mug": mask, "can": None}, camera)
+    assert len(said) == 1
+    watch.end()
+    assert len(said) == 2 and said[1].startswith("can: ") and "fits" in said[1]
+
+
 def test_without_prompts_the_first_picture_is_clicked_on(folder, capsys, monkeypatch):
     from p2p_lib.apps import click
 
@@ -591,9 +642,12 @@ def test_what_was_learnt_of_an_object_is_kept_when_it_is_removed(folder, tmp_pat
     assert not [text for text in found.look_at() if "found again" in text or "no mask and no pose" in text]
 
 
-def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
-    """The page shows the frame that was tracked last; what is sent from there is of the next one."""
-    sequence, errors = open_sequence(folder), []
+def test_objects_are_clicked_on_while_it_runs(tmp_path):
+    """The page shows the frame that was tracked last; what is sent from there is of that, as long as nothing moves."""
+    folder, errors = write_sequence(tmp_path / "slide", FRAMES), []
+    for kind in ("rgb", "depth"):
+        shutil.copy(folder / kind / "0001.png", folder / kind / "0002.png")
+    sequence = open_sequence(folder)
     words = Words(None, errors.append)
     answers = {}
 
@@ -645,10 +699,14 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
 
 
 class Told(list):
-    """In the place of a tracker: the prompts that it is told."""
+    """In the place of a tracker: the prompts that it is told, and the frames that they are of."""
 
-    def tell(self, prompt):
+    def __init__(self):
+        self.of = []
+
+    def tell(self, prompt, frame):
         self.append(prompt)
+        self.of.append(frame)
 
 
 def test_clicks_are_of_the_image_that_is_shown(folder):
@@ -664,15 +722,15 @@ def test_clicks_are_of_the_image_that_is_shown(folder):
         shown = page.masks(click | {"frame": 0})["masks"]["board"]
         page.see(same, {})
         assert page.save(click) == ""
-        assert [prompt.frame for prompt in words.tell(told, 4)] == [4]
-        assert run_lengths(told[0].mask)["counts"] == shown
+        assert [prompt.frame for prompt in words.tell(told, picture(4))] == [4]
+        assert run_lengths(told[0].mask)["counts"] == shown and told.of == [first], "it is looked at once more"
         page.see(later, {})
         assert page.save(click) == "The image has moved on at board: click again."
         page.session()
         with pytest.raises(BadInput, match="frame 6, the one that is shown"):
             page.save(click)
         assert page.save({"objects": [{"name": "board", "frame": 6, "points": [[76, 58]]}]}) == ""
-        assert len(words.tell(told, 7)) == 1
+        assert len(words.tell(told, picture(7))) == 1
 
 
 def test_a_correction_is_of_the_image_that_is_shown(folder):
@@ -689,11 +747,11 @@ def test_a_correction_is_of_the_image_that_is_shown(folder):
             {"name": "wall", "frame": 0, "negative": [[5, 5]]},
         ]
         assert page.save({"objects": said}) == "The image has moved on at board: click again."
-        words.tell(told, 10)
+        words.tell(told, picture(10))
         assert [(prompt.name, prompt.negative_px.tolist()) for prompt in told] == [("wall", [[5, 5]])]
         page.session()
         box = {"name": "board", "frame": 9, "box": [30, 20, 130, 110]}
-        assert page.save({"objects": [box]}) == "" and words.tell(told, 11)[0].box_px is not None
+        assert page.save({"objects": [box]}) == "" and words.tell(told, picture(11))[0].box_px is not None
 
 
 def test_clicks_that_select_nothing_are_refused_on_the_page(folder, monkeypatch):
@@ -730,7 +788,7 @@ def test_whoever_is_to_say_something_is_told_when_and_how(folder, capsys, monkey
     said = Words(None, print)
     said.hear(shown[0].replace("[x, y], ...", "[60, 50]"))
     said.hear(shown[2])
-    assert [(name, prompt is None) for name, prompt in said._pending] == [("mug", False), ("mug", True)]
+    assert [(name, prompt is None) for name, prompt, _ in said._pending] == [("mug", False), ("mug", True)]
     assert cli.main([*words, "--click", "--no-browser"]) == 0
     assert "standard input" not in capsys.readouterr().err
 
@@ -755,7 +813,7 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
         lines.typed.put(None)
         while lines.typed.qsize() or len(errors) < 3:
             time.sleep(0.001)
-        assert words.tell(method, 3) == [] and not method.objects
+        assert words.tell(method, picture(3)) == [] and not method.objects
     said = "\n".join(errors)
     for part in (
         "line: got hello",
@@ -909,6 +967,31 @@ def test_a_camera_of_somebody_elses_is_closed_once_and_what_it_gives_is_checked(
         assert said in capsys.readouterr().err
 
 
+def odd(scripted, sizes):
+    """A camera of somebody else's that gives images of these heights."""
+    for k, h in enumerate(sizes):
+        whole = picture(k)
+        scripted.hand.put(Frame(k, k / 30, whole.rgb[:h], whole.depth_m[:h]))
+    scripted.hand.put(None)
+    return cameras.OwnCamera("mine:Camera", scripted)
+
+
+def test_images_of_another_size_are_left_out_and_said(scripted, recwarn):
+    """All of them, however many others come between; not before one of the right size shows that it is no rule."""
+    camera = odd(scripted, [9, H, 9, 9, H, 9])
+    assert [frame.index for frame in iter(camera.read, None)] == [1, 4]
+    first = f"camera mine:Camera: image 0: {W}x9, not {W}x{H} (width x height) as its camera. It is left out."
+    assert len(recwarn) == 4 and str(recwarn[0].message) == first
+
+
+@pytest.mark.parametrize(("sizes", "count"), [([9] * 3, 3), ([9] * 40, 30), ([H, *[9] * 40], 30)])
+def test_a_camera_whose_images_all_have_another_size_ends_it(scripted, sizes, count, recwarn):
+    camera = odd(scripted, sizes)
+    with pytest.raises(BadInput, match=f"got {W}x9, expected {W}x{H} .* {count} in a row were: make its camera"):
+        deque(iter(camera.read, None), 0)
+    assert not len(recwarn), "of what ends it, it is not said that it is left out"
+
+
 def test_a_live_run_says_that_its_images_are_gone(scripted, folder, tmp_path, capsys):
     for given in (*(open_sequence(folder).frame(k) for k in range(3)), None):
         scripted.hand.put(given)
@@ -966,11 +1049,23 @@ def test_images_after_the_stop_push_none_out(folder, backlog, kept, monkeypatch)
     assert (count.frames, count.dropped) == (len(kept), 8 - len(kept))
 
 
-def test_a_line_may_have_the_frame_of_a_file_of_clicks_which_means_nothing():
-    words, errors = Words(None, print), []
-    words.hear('{"name": "mug", "frame": 40, "points": [[60, 50]]}')
-    with Point2Pose(Camera.from_K(K, W, H)) as method:
-        assert [prompt.frame for prompt in words.tell(method, 3)] == [3] and not errors
+def test_a_line_may_name_the_frame_that_it_is_of():
+    """One that was tracked a while ago: it is kept. One that was not, or long ago, is refused."""
+    errors, told, line = [], Told(), '{"name": "mug", "frame": %d, "points": [[60, 50]]}'
+    words, frames = Words((), errors.append), [picture(2 * k) for k in range(KEPT + 1)]
+    for said, frame in zip(("", line % 0, line % 0, line % 1, line.replace(' "frame": %d,', "")), frames):
+        words.hear(said)
+        words.tell(told, frame)
+    assert [(prompt.frame, of) for prompt, of in zip(told, told.of)] == [(2, frames[0]), (4, frames[0]), (8, None)]
+    for frame in frames[5:]:
+        words.tell(told, frame)
+    words.hear('{"objects": [%s]}' % (line % 0))
+    words.hear(line % 2)
+    words.tell(told, picture(999))
+    assert told.of[3:] == [frames[1]]
+    for k, error in zip((1, 0), errors, strict=True):
+        why = f"got frame {k}, expected one of the last {KEPT} that were tracked. Click on a newer image"
+        assert error.startswith(f"prompt of 'mug': {why}")
 
 
 def test_a_run_of_a_folder_with_models_can_be_scored(folder, tmp_path, capsys):

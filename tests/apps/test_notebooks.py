@@ -370,11 +370,15 @@ def test_what_runs_with_other_values_goes_beside_and_not_over(tmp_path, monkeypa
     earlier = tmp_path / "clone/out/full/notebooks/00_a.ipynb"
     earlier.parent.mkdir(parents=True)
     earlier.write_text("earlier")
-    run_notebooks("full", folder=tmp_path, parameters={"SEED": "3", "NAME": "a b"}, say=lambda line: None)
+    said: list[str] = []
+    run_notebooks("full", folder=tmp_path, parameters={"SEED": "3", "NAME": "a b"}, say=said.append)
+    assert "images in" not in said[0]
     (home,) = set((tmp_path / "clone/out").iterdir()) - {earlier.parents[1]}
     assert home.name == "full_SEED-3_NAME-a-b" and earlier.read_text() == "earlier"
     assert (home / "notebooks/00_a.ipynb").is_file() and (home / "index.html").is_file()
     assert (home / "figures").is_dir() and not (tmp_path / "clone/figures").exists()
+    run_notebooks("full", folder=tmp_path, say=said.clear() or said.append)
+    assert f"images in {tmp_path}/clone/figures" in said[0], "that they go there is said first"
 
 
 def test_a_parameter_must_be_known_to_all_notebooks_that_run(tmp_path):

@@ -357,9 +357,13 @@ def test_interrupted_figures_say_so_and_draw_nothing(tmp_path, monkeypatch, caps
         yield
 
     monkeypatch.setattr("p2p_lib.benchmark.benchmark.execute", interrupted)
-    folder = tmp_path / "pictures"
-    assert cli.main(["figures", "--out", str(tmp_path / "runs"), "--figures", str(folder), "--quiet"]) == 130
+    folder, runs = tmp_path / "pictures", tmp_path / "runs"
+    assert cli.main(["figures", "--out", str(runs), "--figures", str(folder), "--quiet"]) == 130
     assert capsys.readouterr().err == "p2p figures: interrupted\n" and not folder.exists()
+    monkeypatch.setenv("P2P_FIGURES", str(folder))
+    assert cli.main(["figures", "--out", str(runs)]) == 130
+    first = f"Pictures and their index go to {folder}, over those there; --figures DIR: elsewhere. Runs go to {runs}."
+    assert capsys.readouterr().err.splitlines()[0] == first
 
 
 def test_figures_that_are_not_known_are_refused_before_anything_runs(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """The offline pass: bundle adjustment against simulated truth, ties that depth contradicts, and a whole run mended."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,12 +16,14 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import from_toml, preset
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.keypoint_log import KeypointLog
+from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh, read_mesh
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.method.refinement import Keypoints
 from p2p_lib.offline import adjustment, evidence, loops, surface
 from p2p_lib.offline import refine as offline
 from p2p_lib.offline.adjustment import PointObservations, adjust, information, locate, placed
+from p2p_lib.offline.compared import compared
 from p2p_lib.offline.finished import Finished
 from p2p_lib.offline.surface import SurfacePoses, finer_m, fused
 from p2p_lib.offline.surface_check import FittedPose, SurfaceCheck
@@ -343,6 +346,33 @@ def test_what_was_refined_already_is_left_as_it_is(tracked, as_they_were, monkey
         assert cli.main(words) == 0 and len(as_they_were) == 6, "other poses"
     monkeypatch.setattr(offline, "code_digest", lambda: "another")
     assert cli.main(words) == 0 and len(as_they_were) == 8, "other code"
+
+
+def test_which_poses_fit_better_is_said(made, tracked, as_they_were, capsys):
+    """Those are to be kept that keypoints and masks are for; one of the two alone tells nothing."""
+    log = MaskLog(made.sequence.camera)
+    for i in range(len(made.sequence)):
+        for name, mask in made.sequence.masks(i).items():
+            log.add(made.sequence.frame(i), name, mask)
+    log.save(tracked)
+    assert cli.main(["refine", str(tracked), "--quiet"]) == 0
+    title, *_ = said = capsys.readouterr().out.splitlines()[2:-1]
+    assert title.startswith("Causal -> offline, by some of the images") and len(said) == 3
+    shutil.copytree(tracked / "meshes", tracked / "offline/meshes")
+    (box, can), path = compared(tracked), tracked / "offline/poses.npz"
+    same = r": depth on surface (\d+) -> \1 %, mask IoU (\d+) -> \2 %, reprojection 0\.\d+ -> 0\.\d+ px"
+    assert re.fullmatch("box" + same, box) and re.fullmatch("can" + same, can)
+    arrays = dict(np.load(path))
+    aside = se3.exp(np.array([0, 0, 0, 0.015, 0, 0]))
+    arrays["can/T_cam_obj"][::2] = arrays["can/T_cam_obj"][::2] @ aside
+    np.savez(path, **arrays)
+    again, worse = compared(tracked)
+    assert again == box
+    assert re.search(
+        r"px; keep the causal one: keypoints more than 3 px off in 0 -> (4[5-9]|5[0-5]) % of the fr", worse
+    )
+    (tracked / "masks.npz").unlink()
+    assert all("keep" not in line and "IoU" not in line for line in compared(tracked))
 
 
 def test_a_path_may_lead_through_the_result_that_is_replaced(tracked, as_they_were, monkeypatch):

@@ -470,8 +470,9 @@ def test_what_selects_nothing_leaves_an_object_its_mask(say):
     follow.segment(picture(0), [Prompt("left", mask=LEFT)])
     instead = ", too." if "box_px" in say else ", or draw a box."  # that is no advice to who drew one
     words = r"'left' in frame 1: no object was found there\. It keeps the mask that it had\. .* of other colours"
-    with pytest.warns(Doubt, match=words + instead):
+    with pytest.warns(Doubt, match=words + instead) as said:
         kept = follow.segment(Frame(1, 1 / 30, frame.rgb, speck), [Prompt("left", 1, **say)]) == 1
+    assert [str(doubt.message) for doubt in said] == [follow.doubts["left"]], "and nothing else is"
     assert iou(kept, LEFT) > 0.9 and iou(follow.segment(picture(2)) == 1, LEFT) > 0.9
 
 
@@ -495,6 +496,7 @@ def test_doubts_are_of_the_newest_prompts(monkeypatch):
         (LEFT, {"points_px": [[122, 112]]}, ""),
         (WALL, {"points_px": [[120, 110]]}, "farther from its mask than that is long. It starts anew there."),
         (LEFT, {"points_px": [[290, 220]]}, "check that depth is in metres."),
+        (LEFT, {"box_px": (250, 180, 310, 230)}, "check that depth is in metres."),
     ],
 )
 def test_a_correction_that_starts_anew_is_doubted(was, say, said):

@@ -57,6 +57,23 @@ def test_what_is_written_is_read_back(tmp_path, monkeypatch, noise):
     assert made["objects"].startswith("procedural stand-ins") and made["noise"] == noise and made["seed"] == 3
 
 
+def test_a_film_that_is_stopped_is_the_beginning_of_the_whole(tmp_path, monkeypatch):
+    """The same frames to the last bit, with those that the sensor drops among the numbers."""
+    short(monkeypatch, "ycb_meat_sugar", 4)
+    whole, cut = (write_sequence("ycb_meat_sugar", tmp_path / f"{n}", 5, "hard", stop=n) for n in (None, 3))
+    files = [path.relative_to(whole) for path in whole.rglob("*.*g") if path.stem.isdigit()]
+    first = {path for path in files if int(path.stem) < 3}
+    assert first and first < {*files} and first == {p.relative_to(cut) for p in cut.rglob("*.*g") if p.stem.isdigit()}
+    assert all((whole / path).read_bytes() == (cut / path).read_bytes() for path in first)
+    assert [json.loads((of / "scenario.json").read_text()).get("stop") for of in (whole, cut)] == [None, 3]
+    a, b = open_sequence(whole), open_sequence(cut)
+    np.testing.assert_array_equal(a.times_s[: len(b)], b.times_s)
+    for name, truth in b.truth.items():
+        np.testing.assert_array_equal(a.truth[name].T_cam_model[: len(b)], truth.T_cam_model)
+    with pytest.raises(BadInput, match="stop: got 0, expected one past the last frame, from 1"):
+        write_sequence("ycb_meat_sugar", tmp_path / "none", stop=0)
+
+
 def test_the_subset_is_as_the_papers():
     assert len(paper_subset.SEQUENCES) == 5 and 5 * paper_subset.FRAMES == 2705
     for name in paper_subset.SEQUENCES:
