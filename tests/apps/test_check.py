@@ -16,13 +16,13 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.findings import Level, as_lines
+from p2p_lib.core.mask_length import mask_length_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import Misfit, background_share, misfit
 from p2p_lib.datasets.image_sequence import WRITE_K
 from p2p_lib.datasets.images import SKIP_BAD, read_rgb
-from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
