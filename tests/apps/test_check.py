@@ -396,7 +396,7 @@ def test_what_is_wrong_by_metres_follows_from_a_unit_in_doubt(good, tmp_path, aw
     assert names.index("box: depth") < names.index("registration"), "in the order in which it should be mended"
 
 
-def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch, recwarn):
+def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch):
     """What is an edge of depth is in metres; a size that fits says that all is as far as it looks."""
     monkeypatch.setattr(check, "misfit", lambda *_: Misfit(1.0, 20.0, 0.0, 1.5))
     far = scaled_depth(shutil.copytree(good, tmp_path / "far"), 5)
@@ -412,9 +412,10 @@ def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch, recw
     assert found(sized, "box: depth", sizes={"box": 17}).level is Level.WRONG, "one that does not fit tells nothing"
     monkeypatch.setattr("p2p_lib.run.misfit", lambda *_: Misfit(1.0, 20.0, 0.0, 1.5))
     for folder, blamed in ((good, True), (scaled_depth(sized, 4), False)):
-        run(folder, tmp_path / "run", stop=2, if_exists="replace", progress=False)
-        assert any("offset from colour" in str(doubt.message) for doubt in recwarn) == blamed
-        recwarn.clear()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run(folder, tmp_path / "run", stop=2, if_exists="replace", progress=False)
+        assert any("offset from colour" in str(doubt.message) for doubt in caught) == blamed
 
 
 @pytest.mark.parametrize("times", [1, 10])
