@@ -16,7 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import machine
+from common import in_a_line
 from pandas import DataFrame
 
 from p2p_lib.core.config import preset
@@ -183,8 +183,7 @@ def main() -> None:
         rows.append(row(case, args.data))
         print(rows[-1], flush=True)
     shares = {"poor": 100 * POOR, "wrong": 100 * WRONG, "worse": 100 * WORSE}
-    said = ", ".join(f"{key} {value}" for key, value in machine().items() if not key.startswith("load"))
-    args.out.write_text(PAGE.format(machine=said, clicks=CLICKS, rows=as_markdown(DataFrame(rows)), **shares))
+    args.out.write_text(PAGE.format(machine=in_a_line(), clicks=CLICKS, rows=as_markdown(DataFrame(rows)), **shares))
 
 
 if __name__ == "__main__":

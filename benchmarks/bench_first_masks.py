@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import machine
+from common import in_a_line
 from pandas import DataFrame
 
 from p2p_lib.core.backends import make_segmenter
@@ -166,10 +166,8 @@ def main() -> None:
     numbers = DataFrame(rows)[[GIVEN, MEAN, LOWEST]]
     for what, values in (("mean", numbers.mean()), ("lowest", numbers.min())):
         rows.append({"sequence": what, "object": "", **values})
-    ran = machine() | {PACKAGE: version(PACKAGE)}
-    said = ", ".join(f"{what} {value}" for what, value in ran.items() if not what.startswith("load"))
     table = as_markdown(DataFrame(rows).round(1))
-    page = PAGE.format(machine=said, seeds=asked.seeds, clicks=CLICKS, rows=table)
+    page = PAGE.format(machine=in_a_line(**{PACKAGE: version(PACKAGE)}), seeds=asked.seeds, clicks=CLICKS, rows=table)
     (Path(__file__).parent / "first_masks.md").write_text(page)
     print(page)
 

@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from common import machine
+from common import in_a_line
 from pandas import DataFrame
 
 from p2p_lib.core.tables import as_markdown
@@ -62,8 +62,7 @@ def main() -> None:
         numbers = {head: said.objects["mug"][key] for key, (head, _) in HEADS.items()}
         iou = overlap(out, video / "reference_masks" / "mug", (camera.height, camera.width))
         rows.append({"seed": seed, **numbers, "masks with SAM 2's [%]": iou, "verdict": said.verdict("mug")})
-    ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
-    page = PAGE.format(machine=ran, frames=frames, rows=as_markdown(DataFrame(rows).round(1)))
+    page = PAGE.format(machine=in_a_line(), frames=frames, rows=as_markdown(DataFrame(rows).round(1)))
     (Path(__file__).parent / "hand.md").write_text(page)
     print(page)
 

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from common import machine
+from common import in_a_line
 from pandas import DataFrame, Series, concat
 
 from p2p_lib.benchmark.scoring import chamfer
@@ -135,9 +135,8 @@ def main() -> None:
         video = scenario_dir(name, models=str(ycb)) if name in SEQUENCES else video  # rendered when it is needed
         runs = [pair(video, asked.out / f"{name}_{seed}", seed, models, asked.stop) for seed in range(asked.seeds)]
         measured[name] = concat(runs)
-    ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
     page = PAGE.format(
-        machine=ran,
+        machine=in_a_line(),
         seeds=", ".join(map(str, range(asked.seeds))),
         rows=as_markdown(DataFrame([row(name, objects) for name, objects in measured.items()])),
         pairs=as_markdown(DataFrame([paired(*one) for one in [*measured.items(), ("all", concat(measured.values()))]])),

@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 from bench_variants import Varied, columns, tracked
-from common import machine
+from common import in_a_line
 from pandas import DataFrame
 
 from p2p_lib.core import se3
@@ -149,9 +149,8 @@ def main() -> None:
             for one in others.objects:
                 of_one = columns([[of_seed[one]] for of_seed in scores])
                 rows.append({"video": f"{name} from {first}", "": way, "object": one.replace("_", " "), **of_one})
-    ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
     seeds = f"0 to {asked.seeds - 1}" if asked.seeds > 1 else "0"
-    page = PAGE.format(machine=ran, seeds=seeds, rows=as_markdown(DataFrame(rows)))
+    page = PAGE.format(machine=in_a_line(), seeds=seeds, rows=as_markdown(DataFrame(rows)))
     (Path(__file__).parent / "other_objects.md").write_text(page)
     print(page)
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import machine
+from common import in_a_line
 from pandas import DataFrame
 
 from p2p_lib.core.tables import as_markdown
@@ -173,8 +173,7 @@ def main() -> None:
             nothing += absent("desk_fast", desk, out / "desk_absent", bottle + own)
         nothing += absent("synthetic/occlusion", "synthetic/occlusion", out / "occlusion_absent", bottle + own)
     rows += synthetic(out, asked.cases)
-    ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
-    kept = {"machine": ran, "sight": _SIGHT_PX, "frames": _FRAMES}
+    kept = {"machine": in_a_line(), "sight": _SIGHT_PX, "frames": _FRAMES}
     page = PAGE.format(found=as_markdown(DataFrame(rows)), absent=as_markdown(DataFrame(nothing)), **kept)
     (Path(__file__).parent / "recall.md").write_text(page)
     print(page)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from common import machine
+from common import in_a_line
 from pandas import DataFrame
 
 from p2p_lib.core.camera import Camera
@@ -166,9 +166,8 @@ def main() -> None:
                 runs = [asked.out / f"{name}_{of.name.replace(' ', '_')}_{seed}" for seed in range(asked.seeds)]
                 scores = [list(of_seed.values()) for of_seed in tracked(of, [how] * asked.seeds, runs)]
                 rows.append({"video": name, "": of.name, **columns(scores)})
-    ran = ", ".join(f"{what} {value}" for what, value in machine().items() if not what.startswith("load"))
     seeds = f"0 to {asked.seeds - 1}" if asked.seeds > 1 else "0"
-    page = PAGE.format(machine=ran, seeds=seeds, rows=as_markdown(DataFrame(rows)))
+    page = PAGE.format(machine=in_a_line(), seeds=seeds, rows=as_markdown(DataFrame(rows)))
     (Path(__file__).parent / "variants.md").write_text(page)
     print(page)
 

@@ -147,3 +147,8 @@ def machine() -> dict[str, str]:
         "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
         "commit": f"{commit}, {time.strftime('%Y-%m-%d', time.gmtime())}",
     }
+
+
+def in_a_line(**more: str) -> str:
+    """The same, with what is named besides; without the load, on which accuracy does not depend."""
+    return ", ".join(f"{what} {value}" for what, value in (machine() | more).items() if not what.startswith("load"))

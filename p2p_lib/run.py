@@ -36,7 +36,7 @@ from p2p_lib.datasets.run_writer import IfExists, RunWriter
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.evaluation.known_size import in_masks_m
 from p2p_lib.evaluation.oracle import OracleTracker
-from p2p_lib.evaluation.protocol import Evaluation, evaluate, model_frames, rate
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, Evaluation, evaluate, model_frames, rate
 from p2p_lib.evaluation.readings import doubt_reading
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.evaluation.true_tracks import TrueScene
@@ -168,7 +168,7 @@ def import_poses(
     sequence: str | Path | sequences.Sequence,
     models: Mapping[str, str | Path] | None = None,
     align: str = "first",
-    min_visible_px: int = 300,
+    min_visible_px: int = MIN_VISIBLE_PX,
     format: str | None = None,
     start: int = 0,
     stop: int | None = None,
@@ -203,7 +203,7 @@ def export_run(
     run = load_run(folder)
     in_model = (frame or ("model" if format == "bop" else "object")) == "model"
     path = run.info.get("path")
-    sequence = sequences.open_sequence(path, run.info["format"]) if path and Path(path).is_dir() else None
+    sequence = sequences.reopen(run.info) if path and Path(path).is_dir() else None
     frames = model_frames(run) if in_model else None
     confident = {name: obj.of_confidence(min_confidence) for name, obj in run.objects.items()}
     return export(replace(run, objects=confident), out, format, frames, sequence)

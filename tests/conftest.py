@@ -22,7 +22,7 @@ settings.load_profile("suite")
 
 PROJECT = Path(__file__).resolve().parents[1]
 #: Fixtures of several packages.
-pytest_plugins = ["tests.fixtures.made_run", "tests.fixtures.moving_frames"]
+pytest_plugins = ["tests.fixtures.made_run", "tests.fixtures.moving_frames", "tests.fixtures.runs_here"]
 
 
 NO_GPU = "torch finds no CUDA device"
@@ -73,10 +73,16 @@ def tool():
 
 @pytest.fixture(scope="session")
 def opening(tmp_path_factory):
-    """Renders the first frames of a bundled sequence, for those who look at no others: all take half a minute."""
+    """Renders some frames of a bundled sequence, so many or a range, for those who look at no others.
+
+    All take half a minute.
+    """
     from studies.recovery import excerpt
 
-    return lambda name, frames, seed=0: excerpt(name, range(frames), seed, tmp_path_factory.mktemp(name))
+    def render(name: str, frames: int | range, seed: int = 0):
+        return excerpt(name, range(frames) if isinstance(frames, int) else frames, seed, tmp_path_factory.mktemp(name))
+
+    return render
 
 
 @pytest.fixture

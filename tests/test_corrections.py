@@ -15,7 +15,6 @@ from p2p_lib.datasets.first_masks import FILE
 from p2p_lib.datasets.images import read_rgb
 from p2p_lib.datasets.prompts import prompts_in
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import run
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
@@ -27,9 +26,9 @@ HANDLE = 388.0, 262.0
 
 
 @pytest.fixture(scope="module")
-def before(tmp_path_factory):
+def before(tmp_path_factory, opening):
     """The bundled mug, its start, and a run of it."""
-    sequence = open_sequence("synthetic/mug")
+    sequence = opening("mug", FRAMES)
     (start,) = prompts_in(sequence.masks(0))
     out = tmp_path_factory.mktemp("runs") / "before"
     run(sequence, out, prompts=[start], stop=FRAMES, save_masks=True, settings=FAST, progress=False)
@@ -100,9 +99,9 @@ def test_a_correction_is_drawn_and_one_that_grows_is_doubted(before, tmp_path):
 
 
 @pytest.mark.parametrize(("late", "too_much"), [(0, False), (0, True), (2, True)])
-def test_the_estimate_says_that_a_correction_takes_in_a_neighbour(late, too_much):
+def test_the_estimate_says_that_a_correction_takes_in_a_neighbour(late, too_much, opening):
     """In Python, live and ROS, too, also where a tracker answers late; one that takes in nothing is as sure as ever."""
-    sequence = open_sequence("synthetic/crossing")
+    sequence = opening("crossing", AT + 3)
     method, estimates, said = Point2Pose(sequence.camera, preset().with_values(FAST), tracker=Late(late)), {}, []
     method.add_object("can", mask=sequence.masks(0)["can"])
     for index in range(AT + late + 1):
@@ -127,7 +126,7 @@ def test_a_box_around_too_much_is_doubted_on_the_page_and_by_a_check(before, tmp
     with Clicker(sequence, tmp_path / "prompts.json", run=was) as clicker:
         for prompt, many in ((wrong, True), (right, False)):
             _, doubts = clicker.made([prompt], clicker.kept_masks(AT))
-            checked = [f.text for f in check_folder("synthetic/mug", prompts=[start, prompt]) if "clicks" in f.name]
+            checked = [f.text for f in check_folder(sequence, prompts=[start, prompt]) if "clicks" in f.name]
             for texts in (doubts, checked):
                 assert any("times as long as before" in text for text in texts) == many
 
@@ -143,9 +142,9 @@ def test_the_page_compares_a_correction_with_the_run_before_not_with_the_mask_th
 
 def test_a_mask_that_says_hidden_is_no_trouble_to_a_check(before):
     """An empty mask in a later frame says that the object is not in view: it has no length."""
-    _, start, _ = before
+    sequence, start, _ = before
     hidden = Prompt(start.name, AT, mask=np.zeros((480, 640), bool))
-    assert not [f.text for f in check_folder("synthetic/mug", prompts=[start, hidden]) if "clicks" in f.name]
+    assert not [f.text for f in check_folder(sequence, prompts=[start, hidden]) if "clicks" in f.name]
 
 
 def test_a_misspelt_object_is_asked_about(before, tmp_path):

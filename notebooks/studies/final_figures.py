@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 #: Plans whose quick form is run where there is nothing in full: images are drawn from them, or no table is shipped.
-RUN_HERE = ("ho3d", "long_range", "segmenters", "ycbmultitrack_real")
+RUN_HERE = ("long_range", "segmenters")
 
 
 def results_to_show(
@@ -61,6 +61,11 @@ def results_to_show(
                 save_outcome(out, perform(measured, job, out, library_version()))
         results[name] = load_benchmark(name, out, "quick")
     return results
+
+
+def first_with_runs(results: Mapping[str, Benchmark], *plans: str) -> Benchmark:
+    """Of plans that an image could be of, the first that was run."""
+    return next(results[name] for name in plans if results[name].counts()["done"])
 
 
 def shown_table(benchmark: Benchmark, parameters: Mapping[str, object] | None = None) -> Saved | Markdown:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from shutil import rmtree
 from textwrap import fill
@@ -31,6 +32,7 @@ from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.generate import write_scenario
 from p2p_lib.synthetic.noise import Sensor
 from p2p_lib.synthetic.scenarios import SCENARIOS
+from p2p_lib.synthetic.scene import Scenario
 from studies.run_plots import draw_strip
 
 #: Of fewer poses a share of right ones is no more than a hint.
@@ -45,9 +47,15 @@ def return_strip(scenes: Mapping[str, Scene], name: str, event: RecoveryEvent) -
     return strip(scenes, name, shown)
 
 
+@lru_cache(1)
+def _scenario(name: str, seed: int) -> Scenario:
+    """A hand that holds a thing takes seconds to close."""
+    return SCENARIOS[name](seed)
+
+
 def excerpt(name: str, frames: range, seed: int, folder: Path) -> Video:
     """These frames of ``synthetic/NAME``, rendered into ``folder``, whose earlier content goes: no others are."""
-    whole = SCENARIOS[name](seed)
+    whole = _scenario(name, seed)
     bodies = tuple(replace(body, T_world_model=body.T_world_model[frames]) for body in whole.bodies)
     rmtree(folder, ignore_errors=True)
     write_scenario(folder, replace(whole, T_world_cam=whole.T_world_cam[frames], bodies=bodies), Sensor(), seed, name)
@@ -57,7 +65,7 @@ def excerpt(name: str, frames: range, seed: int, folder: Path) -> Video:
 
 def fastest(name: str, seed: int, before: int = 20, after: int = 12) -> tuple[range, np.ndarray]:
     """Frames of ``synthetic/NAME`` about its first body's largest turn, and the turn after each (degrees)."""
-    T_world_model = SCENARIOS[name](seed).bodies[0].T_world_model
+    T_world_model = _scenario(name, seed).bodies[0].T_world_model
     turn_deg = np.degrees(se3.angle_rad(se3.inverse(T_world_model[:-1]) @ T_world_model[1:]))
     worst = int(turn_deg.argmax())
     frames = range(max(0, worst - before), min(worst + after, len(turn_deg)))

@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 
 from p2p_lib.apps.command_line import open_page
-from p2p_lib.core.backends import DEFAULT_SEGMENTER, make_segmenter
 from p2p_lib.core.colours import OBJECTS
 from p2p_lib.core.config import Config, preset
+from p2p_lib.core.earlier import selected
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
 from p2p_lib.core.mask_length import doubt_growth, mask_length_m
@@ -194,11 +194,9 @@ def clicked_masks(
     found: FirstMasks = {}
     for i, of_frame in prompts_by_frame(prompts, range(len(sequence)), sequence.camera, was).items():
         frame = sequence.frame(i)
-        segmenter = make_segmenter(DEFAULT_SEGMENTER, sequence.camera, config.segmentation)
-        if known := [Prompt(p.name, i, mask=was[p.name]) for p in of_frame if p.name in was and p.mask is None]:
-            segmenter.segment(frame, known)
-        labels = segmenter.segment(frame, [prompt for prompt in of_frame if prompt.name not in found])
-        found |= {name: (frame, labels == label) for label, name in enumerate(segmenter.names, 1)}
+        new = [prompt for prompt in of_frame if prompt.name not in found]
+        masks, _ = selected(frame, new, sequence.camera, config.segmentation, was)
+        found |= {name: (frame, mask) for name, mask in masks.items()}
     return found
 
 

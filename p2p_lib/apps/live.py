@@ -151,7 +151,7 @@ def track_live(
         while frame is not None:
             while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
                 method.tell(prompts.pop(0))
-            every_prompt += words.tell(method, frame.index) if words else []
+            every_prompt += words.tell(method, frame) if words else []
             tell(method.step(frame))
             if frame is not first:  # which may be long ago
                 count.count(frame)

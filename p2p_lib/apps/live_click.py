@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from p2p_lib.apps.click import Clicker
 from p2p_lib.apps.live_words import Words
-from p2p_lib.core.depth_edges import depth_step_m
+from p2p_lib.core.earlier import has_moved, with_mask
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.cameras import LiveCamera, Stream
-from p2p_lib.datasets.prompts import parse_prompts, run_lengths
-from p2p_lib.segmenters.builtin.patch import dilated
-
-#: A colour that is so much another, of 255, is no noise; what has moved differs in so large a share of its colours, or
-#: of its depths. By these a mask is refused from where 0.92 of it is still right on, and always below 0.88.
-_OTHER_COLOUR, _COLOURS, _DEPTHS = 25, 0.3, 0.2
-#: A correction is judged by what is so near its clicks, pixels.
-_NEAR_PX = 8
+from p2p_lib.datasets.prompts import parse_prompts
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,44 +80,13 @@ class LiveClicker(Clicker):
         if isinstance(content, dict) and content.keys() == {"remove"}:
             self._words.hear(json.dumps(content))
             return ""
-        prompts, then, now = self.checked(content, self._names), self._shown, self._newest[0]
+        prompts, then = self.checked(content, self._names), self._shown
+        made, _ = self.made([prompt for prompt in prompts if prompt.mask is None], self._masks)
+        made = {name: mask for name, mask in made.items() if name not in self._names}
+        prompts = tuple(with_mask(prompt, made) for prompt in prompts)
+        now = self._newest[0]  # making masks takes a while
         if then is None or now is None:
             return ""  # checked above
-        made, _ = self.made([prompt for prompt in prompts if prompt.mask is None], self._masks)
-        said: list[dict[str, Any]] = []
-        moved: list[dict[str, Any]] = []
-        for prompt, entry in zip(prompts, content["objects"]):  # type: ignore[index]  # it has been parsed
-            if prompt.mask is not None:
-                mask = prompt.mask
-            elif prompt.name in self._names:
-                mask = _near(prompt, then.shape)
-            else:
-                mask = made[prompt.name]
-                if not mask.any():
-                    fix = "Click on another place of it."
-                    raise BadInput(f"clicks on {prompt.name!r}", "nothing found there", "an object", fix)
-                entry = {"name": prompt.name, "mask": run_lengths(mask)}
-            (moved if now is not then and _moved(then, now, mask) else said).append(entry)
-        if said:
-            self._words.hear(json.dumps({"objects": said}))
-        return f"The image has moved on at {', '.join(entry['name'] for entry in moved)}: click again." if moved else ""
-
-
-def _near(prompt: Prompt, shape: Sequence[int]) -> np.ndarray:
-    """(H, W) bool: the pixels that a prompt without a mask is about."""
-    region = np.zeros(shape, np.uint8)
-    for u, v in np.concatenate([prompt.points_px, prompt.negative_px]).round().astype(int).tolist():
-        cv2.circle(region, (u, v), _NEAR_PX, 1, -1)
-    if prompt.box_px is not None:
-        left, top, right, bottom = prompt.box_px.round().astype(int).clip(0).tolist()
-        region[top : bottom + 1, left : right + 1] = 1
-    return region > 0
-
-
-def _moved(then: Frame, now: Frame, mask: np.ndarray) -> bool:
-    """Whether what is in and about a mask (H, W) bool of an earlier frame is no longer there."""
-    before, after = (cv2.blur(frame.rgb, (5, 5)).astype(int) for frame in (then, now))
-    other = np.abs(before - after).max(-1)[dilated(mask, 2)] > _OTHER_COLOUR
-    both = mask & (then.depth_m > 0) & (now.depth_m > 0)
-    off = np.abs(then.depth_m - now.depth_m)[both] > depth_step_m(then.depth_m[both])
-    return bool(other.mean() > _COLOURS or (off.size and off.mean() > _DEPTHS))
+        moved = [prompt for prompt in prompts if has_moved(prompt, then, now)]
+        self._words.add((prompt for prompt in prompts if prompt not in moved), then)
+        return f"The image has moved on at {', '.join(prompt.name for prompt in moved)}: click again." if moved else ""

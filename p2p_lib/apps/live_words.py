@@ -13,11 +13,14 @@ from urllib.parse import urlsplit
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean, in_a_line
 from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import KEYS, parse_prompts
 from p2p_lib.extended.default import Point2Pose
 
 #: What a line says.
 FORM = '{"name": "mug", "points": [[x, y], ...]} or {"remove": "mug"}'
+#: So many of the frames that were tracked last may be named in lines.
+KEPT = 60
 #: A reader that takes no line for so long is no longer there, and is looked for again every so often, s.
 _GONE_S, _AGAIN_S = 0.5, 1.0
 
@@ -26,14 +29,17 @@ class Words:
     """Lines of JSON that add, correct and remove objects, as they come: by a thread that reads them, or :meth:`hear`.
 
     ``{"name": "mug", "points": [[320, 240]]}`` starts an object in the next frame, or corrects its mask; ``negative``
-    and ``box`` as in a file of ``p2p click``, whose whole content is understood, too: a ``frame`` in it means nothing
-    here. ``{"remove": "mug"}`` ends it. What does not fit is said, and changes nothing.
+    and ``box`` as in a file of ``p2p click``, whose whole content is understood, too. With a ``frame`` it is said of
+    that one, which has to be one of the last :data:`KEPT` that were tracked. ``{"remove": "mug"}`` ends it. What does
+    not fit is said, and changes nothing.
     """
 
     def __init__(self, lines: Iterable[str] | None, say: Callable[[str], object]):
-        self._pending: deque[tuple[str, Prompt | None]] = deque()
+        # With the frame that each is of, or whether its prompt names one.
+        self._pending: deque[tuple[str, Prompt | None, Frame | bool]] = deque()
         self._say = say
         self.reads = lines is not None  # by itself
+        self._seen: deque[Frame] = deque(maxlen=KEPT if self.reads else 0)
         if lines is not None:
             threading.Thread(target=lambda: deque(map(self.hear, lines), 0), daemon=True).start()
 
@@ -44,42 +50,56 @@ class Words:
         except BadInput as error:
             self._say(str(error))
 
-    def tell(self, method: Point2Pose, frame_index: int) -> list[Prompt]:
+    def add(self, prompts: Iterable[Prompt], then: Frame) -> None:
+        """Take in what is said of a frame, however long ago that was."""
+        self._pending.extend((prompt.name, prompt, then) for prompt in prompts)
+
+    def tell(self, method: Point2Pose, frame: Frame) -> list[Prompt]:
         """Tell a tracker what was said since, before its next frame; the prompts that it took."""
         taken = []
         while self._pending:
-            name, prompt = self._pending.popleft()
+            name, prompt, of = self._pending.popleft()
             try:
                 if prompt is None:
                     method.remove_object(name)
                 else:
-                    prompt = replace(prompt, frame=frame_index)
-                    method.tell(prompt)
+                    then = of if isinstance(of, Frame) else self._kept(prompt) if of else None
+                    prompt = replace(prompt, frame=frame.index)
+                    method.tell(prompt, then)
                     taken.append(prompt)
             except BadInput as error:
                 self._say(str(error))
+        self._seen.append(frame)
         return taken
 
+    def _kept(self, prompt: Prompt) -> Frame:
+        """The frame whose number a prompt names."""
+        for frame in self._seen:
+            if frame.index == prompt.frame:
+                return frame
+        expected = f"one of the last {KEPT} that were tracked"
+        fix = "Click on a newer image; without a frame the next one is meant."
+        raise BadInput(f"prompt of {prompt.name!r}", f"frame {prompt.frame}", expected, fix)
 
-def _parsed(line: str) -> list[tuple[str, Prompt | None]]:
-    """Object and prompt of each thing that a line says; no prompt: it is to be removed."""
+
+def _parsed(line: str) -> list[tuple[str, Prompt | None, bool]]:
+    """Object and prompt of each thing that a line says, and whether it names a frame; no prompt: it is removed."""
     try:
         message = json.loads(line)
     except ValueError as error:
         raise BadInput("line", f"{line.strip()[:60]} ({in_a_line(error)})", FORM) from None
     if isinstance(message, dict) and message.keys() == {"remove"} and isinstance(message["remove"], str):
-        return [(message["remove"], None)]
-    if isinstance(message, dict) and "objects" in message:
-        prompts = parse_prompts(message)
-    elif isinstance(message, dict) and {"name"} < message.keys() <= KEYS:
-        prompts = parse_prompts({"objects": [message]})
-    else:
+        return [(message["remove"], None, False)]
+    if isinstance(message, dict) and {"name"} < message.keys() <= KEYS:
+        message = {"objects": [message]}
+    if not isinstance(message, dict) or "objects" not in message:
         known = isinstance(message, dict) and "name" in message
         odd = sorted(message.keys() - KEYS) if known else []
         where = f"Say where it is: {', '.join(sorted(KEYS - {'name', 'frame'}))}."
         fix = f"{odd[0]!r} is not known. {did_you_mean(odd[0], KEYS) or where}" if odd else where if known else ""
         raise BadInput("line", line.strip()[:60], FORM, fix)
-    return [(prompt.name, prompt) for prompt in prompts]
+    prompts = zip(message["objects"], parse_prompts(message), strict=True)
+    return [(prompt.name, prompt, "frame" in entry) for entry, prompt in prompts]
 
 
 @contextmanager

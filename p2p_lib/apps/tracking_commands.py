@@ -197,7 +197,7 @@ def _without_map(run: Path) -> list[str]:
     arg(
         "--listen",
         action="store_true",
-        help="lines of JSON on standard input add, correct and remove objects; their frame is the next one",
+        help="lines of JSON on standard input add, correct and remove objects, in the next frame or the one they name",
     ),
     arg("--click", action="store_true", help="a page on the newest image adds, corrects and removes objects"),
     output("DIR", "folder that keeps the run, as p2p run does"),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.checked_answers import kind_of
+from p2p_lib.core.checked_answers import bad_answer, kind_of
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.types import Frame, Tracks
@@ -111,6 +111,4 @@ class CheckedTracker:
         return tracks
 
     def _bad(self, call: str, got: str, expected: str, fix: str = "") -> BadInput:
-        at = f", frame {self._frame}" if self._frame >= 0 else ""
-        who = f"tracker {self.name!r} ({type(self._tracker).__name__}){at}: {call}"
-        return BadInput(who, got, expected, fix)
+        return bad_answer("tracker", self._tracker, self._frame, call, got, expected, fix)

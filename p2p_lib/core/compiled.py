@@ -98,13 +98,16 @@ def _ready(module: str, missed: Callable[[], object] = lambda: None) -> bool:
     """Have all functions of a module compiled; whether any was not kept from before, and ``missed`` called at each."""
     import_module(module)
     _compile(module)
+    from numba.core.sigutils import normalize_signature
+
     any_missed = False
     _warm.add(module)
     for (of, name), arguments in _arguments.items():
         if of == module and arguments:
             function = getattr(sys.modules[module], name)
             for types in arguments:
-                function.compile(f"({types})")
+                # Kept by what it is given: by words, who calls the function without this compiles it again.
+                function.compile(normalize_signature(f"({types},)")[0])
             if sum(function.stats.cache_misses.values()):
                 any_missed = True
                 missed()

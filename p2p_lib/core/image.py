@@ -43,6 +43,12 @@ def bounds(mask: np.ndarray, margin_px: int = 0) -> tuple[slice, slice]:
     return rows, columns
 
 
+def ends_px(mask: np.ndarray) -> np.ndarray:
+    """(2, 2) x, y of the first pixel of a mask's (H, W) bounding box, and of the first beyond it."""
+    rows, columns = bounds(mask)
+    return np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+
+
 def outline_px(mask: np.ndarray, beside_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, 2) each: the pixels along the outline of a mask's (H, W) largest part, and what is beside, inside and out.
 
@@ -58,6 +64,15 @@ def outline_px(mask: np.ndarray, beside_px: float) -> tuple[np.ndarray, np.ndarr
     u, v = nearest_px(uv_px + across, mask.shape)
     inwards = np.where(mask[v, u][:, None], across, -across)
     return uv_px, uv_px + inwards, uv_px - inwards
+
+
+def shares(part: np.ndarray, holds: np.ndarray, fewest: int) -> np.ndarray:
+    """(K,) of each part, whose number pixels have in ``part`` (N,) int, the share that holds (N,) bool.
+
+    Parts of fewer pixels than ``fewest``, at least 1, are left out.
+    """
+    count = np.bincount(part)
+    return (np.bincount(part, holds) / np.maximum(count, 1))[count >= fewest]
 
 
 def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:

@@ -120,8 +120,8 @@ class LazyHints(Mapping[str, Hint]):
 class Segmenter(Protocol):
     """A streaming, causal segmenter of several objects.
 
-    It may have ``doubts``, too: of objects that a prompt of the newest frame has started, what is doubtful about their
-    masks. Their first pose is doubted then, and says so.
+    It may have ``doubts``, too: of objects that a prompt of the newest frame has started or corrected, what is doubtful
+    about their masks. Their poses in that frame are doubted then, and say so.
     """
 
     name: str

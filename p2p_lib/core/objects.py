@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.config import Config
 from p2p_lib.core.depth import depth_trouble
+from p2p_lib.core.earlier import check_still, selected, with_mask
 from p2p_lib.core.errors import BadInput, did_you_mean, doubt
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.prediction import Prediction, Predictor
-from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, given_masks
+from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_frame, check_prompt, given_masks
 from p2p_lib.core.types import DOUBTED, NOT_FOUND, NOT_SEEN, OUT_OF_VIEW, Frame, PoseEstimate, Status
 
 
@@ -48,6 +50,8 @@ class Objects(ABC, Generic[FollowedT]):
     refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
     """
 
+    config: Config
+
     def __init__(self, camera: Camera):
         if not isinstance(camera, Camera):
             fix = "Make one: Camera(fx, fy, cx, cy, width, height), or Camera.from_K(K, width, height)."
@@ -57,6 +61,8 @@ class Objects(ABC, Generic[FollowedT]):
         self.refused: dict[str, BadInput] = {}
         self._ignored: dict[str, str] = {}  # of corrections of the newest frame
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
+        self._earlier: dict[str, Frame] = {}  # that prompts are of, where it is not the one to come
+        self._doubts: dict[tuple[str, int], str] = {}  # about masks made of those, by object and frame
         self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._unstarted: dict[str, str] = {}  # objects, and why what was selected of them last did not start them
@@ -128,26 +134,30 @@ class Objects(ABC, Generic[FollowedT]):
         clicks: ArrayLike | None = None,
         negative: ArrayLike | None = None,
         box: ArrayLike | None = None,
+        *,
+        frame: Frame | None = None,
     ) -> None:
         """Follow one more object from the next frame on. The segmenter finds it in every frame that brings no mask.
 
         mask      (H, W) bool: its pixels in the next frame
         clicks    (N, 2) pixels on it in the next frame; ``negative`` (M, 2) are not of it
         box       (4,) left, top, right, bottom: all of it is inside in the next frame
+        frame     the earlier frame that they are of, where it is not the next one: what they select in it is the
+                  object's mask in the next one, where nothing has moved in and about it since
 
         With none of them it is started by the first mask that ``step`` gets for it, or by :meth:`correct`, and its
-        estimates say until then that it waits for them. Raises :class:`BadInput` for what
-        does not fit, and nothing has changed. What shows to be unusable in the next frame itself, as clicks where no
-        depth was measured, is forgotten with that frame: ``refused`` and the reason of the object's estimates say why,
-        until :meth:`correct` says something better.
+        estimates say until then that it waits for them. Raises :class:`BadInput` for what does not fit, and nothing has
+        changed. What shows to be unusable in the next frame itself, as clicks where no depth was measured, or something
+        has moved since the ``frame`` that they are of, is forgotten with that frame: ``refused`` and the reason of the
+        object's estimates say why, until :meth:`correct` says something better.
         """
         if file_name("object name", name) in self.objects:
             raise BadInput("add_object", repr(name), "a name not in use", f"In use: {', '.join(self.objects)}.")
-        if mask is clicks is negative is box is None:
+        if mask is clicks is negative is box is frame is None:
             with self.alone():
                 self.begin(name)
         else:
-            self.tell(_prompt(name, mask, clicks, negative, box))
+            self.tell(_prompt(name, mask, clicks, negative, box), frame)
 
     def correct(
         self,
@@ -157,16 +167,24 @@ class Objects(ABC, Generic[FollowedT]):
         clicks: ArrayLike | None = None,
         negative: ArrayLike | None = None,
         box: ArrayLike | None = None,
+        frame: Frame | None = None,
     ) -> None:
         """Mend an object's mask in the next frame; arguments as of :meth:`add_object`. The last correction counts."""
         self._check_known("correct", name)
-        self.tell(_prompt(name, mask, clicks, negative, box))
+        self.tell(_prompt(name, mask, clicks, negative, box), frame)
 
-    def tell(self, prompt: Prompt) -> None:
-        """A prompt for the next frame, whichever that is: it starts its object, or corrects its mask."""
+    def tell(self, prompt: Prompt, frame: Frame | None = None) -> None:
+        """A prompt for the next frame, whichever that is: it starts its object, or corrects its mask.
+
+        frame  the earlier one that it is of, as of :meth:`add_object`
+        """
         name, known = prompt.name, self.segmenter.names
         check_prompt(prompt, self.camera)
-        check_apart((other for other in self._prompts.values() if other.name != name), prompt)
+        others = (other for other in self._prompts if other != name and self._earlier.get(other) is frame)
+        check_apart(map(self._prompts.__getitem__, others), prompt)
+        if frame is not None:
+            check_frame(frame, self.camera)
+            check_depth(prompt, frame)
         if name not in known and not prompt.starts:
             what = "an empty mask" if prompt.mask is not None else "negative clicks alone"
             raise BadInput(f"object {name!r}", what, "a click on it, a box or at least one pixel of its mask")
@@ -174,6 +192,8 @@ class Objects(ABC, Generic[FollowedT]):
             if name not in self.objects:
                 self.begin(name)
             self._prompts[name] = prompt
+            self._earlier.pop(name, None)
+            self._earlier |= {} if frame is None else {name: frame}
             self.refused.pop(name, None)
             self._unstarted.pop(name, None)
 
@@ -186,7 +206,7 @@ class Objects(ABC, Generic[FollowedT]):
         with self.alone():
             if len(ids := self.objects.pop(name).ids):
                 self.tracker.drop(ids)
-            for kept in (self._prompts, self.refused, self._without, self._unstarted):
+            for kept in (self._prompts, self._earlier, self.refused, self._without, self._unstarted):
                 kept.pop(name, None)
             self._predictor.forget(name)
             if name in self.segmenter.names:
@@ -210,20 +230,46 @@ class Objects(ABC, Generic[FollowedT]):
     ) -> tuple[dict[str, np.ndarray | None], dict[str, Prompt]]:
         """Every object's mask in this frame, None for one to be found, and the prompts for this frame.
 
-        Every prompt since the last frame belongs to this one; one that does not fit it is ``refused``.
+        Every prompt since the last frame belongs to this one, or to an earlier one that was named; one that does not
+        fit it is ``refused``.
         """
-        given, refused = given_masks(frame, masks, self._prompts, self.objects, self.camera)
+        check_frame(frame, self.camera)
+        prompts, stale, doubts = self._carried(frame)
+        given, refused = given_masks(frame, masks, prompts, self.objects, self.camera)
+        refused |= stale
         self._cameras.append((frame.time_s, frame.T_world_cam))
         while len(self._cameras) > self.tracker.latency_frames + 1:
             self._cameras.popleft()
-        prompts, self._prompts = {name: p for name, p in self._prompts.items() if name not in refused}, {}
+        self._prompts, self._earlier = {}, {}
+        self._doubts |= {(name, frame.index): text for name, text in doubts.items() if name not in refused}
         self.refused |= refused
         self._ignored = {}
         for name, error in refused.items():
             if name in self.segmenter.names:
                 what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
                 self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}")
-        return given, prompts
+        return given, {name: prompt for name, prompt in prompts.items() if name not in refused}
+
+    def _carried(self, now: Frame) -> tuple[dict[str, Prompt], dict[str, BadInput], dict[str, str]]:
+        """The prompts as they hold in a frame, why others do not, and what is doubtful about the masks made of them.
+
+        Clicks of an earlier frame become the masks that they select there, all together, but for those that correct.
+        """
+        held, refused, doubts = dict(self._prompts), dict[str, BadInput](), dict[str, str]()
+        for then in dict.fromkeys(self._earlier.values()):
+            names, made = [name for name, of in self._earlier.items() if of is then], dict[str, np.ndarray]()
+            starting = [held[name] for name in names if name not in self.segmenter.names]
+            if any(prompt.mask is None for prompt in starting):
+                made, said = selected(then, starting, self.camera, self.config.segmentation)
+                doubts |= said
+            for name in names:
+                try:
+                    held[name] = with_mask(held[name], made)
+                    check_still(held[name], then, now)
+                except BadInput as error:
+                    refused[name] = error
+                    del held[name]
+        return held, refused, doubts
 
     def explained(
         self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, given: np.ndarray | None
@@ -234,10 +280,10 @@ class Objects(ABC, Generic[FollowedT]):
                      None where there was none
 
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
-        is no world of the user's. The first pose of an object whose mask is doubtful is doubted.
+        is no world of the user's. In the frame of a prompt that made a doubtful mask the object's pose is doubted.
         """
         name = estimate.object
-        said = getattr(self.segmenter, "doubts", {}).get(name, "")
+        said = self._doubts.pop((name, frame.index), getattr(self.segmenter, "doubts", {}).get(name, ""))
         if said:
             estimate = replace(estimate, confidence=min(estimate.confidence, DOUBTED))
         self._next_map[name] = max(self._next_map.get(name, 0), estimate.map_id + 1)

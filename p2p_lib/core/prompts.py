@@ -94,6 +94,15 @@ def check_prompt(prompt: Prompt, camera: Camera, where: str = "") -> None:
         raise BadInput(f"clicks on {name!r}", "a positive and a negative click on one pixel", "one or the other")
 
 
+def check_frame(frame: Frame, camera: Camera) -> None:
+    """Refuse what is no frame, and one of another size than the camera's images."""
+    if not isinstance(frame, Frame):
+        got = f"{type(frame).__name__} {getattr(frame, 'shape', '')}".strip()
+        raise BadInput("frame", got, "Frame(index, time_s, rgb, depth_m)", "Colour needs its depth and its time.")
+    if frame.shape != (camera.height, camera.width):
+        raise wrong_size(f"frame {frame.index}", frame.shape, (camera.height, camera.width), "the camera")
+
+
 def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
     """Refuse a mask of another size than the camera's images; none at all is fine."""
     if mask is not None and mask.shape != (camera.height, camera.width):
@@ -149,14 +158,9 @@ def given_masks(
 ) -> tuple[dict[str, np.ndarray | None], dict[str, BadInput]]:
     """Every object's mask in a frame, by ``masks`` and ``prompts``; None for one that nobody gives.
 
-    Also why what is said of some objects does not fit this frame: it is not used. Raises :class:`BadInput` for a frame
-    of another size and masks of unknown objects.
+    Also why what is said of some objects does not fit this frame: it is not used. Raises :class:`BadInput` for masks of
+    unknown objects.
     """
-    if not isinstance(frame, Frame):
-        got = f"{type(frame).__name__} {getattr(frame, 'shape', '')}".strip()
-        raise BadInput("frame", got, "Frame(index, time_s, rgb, depth_m)", "Colour needs its depth and its time.")
-    if frame.shape != (camera.height, camera.width):
-        raise wrong_size(f"frame {frame.index}", frame.shape, (camera.height, camera.width), "the camera")
     if not isinstance(masks, Mapping):
         raise BadInput("masks", type(masks).__name__, "a dictionary: the name of each object, and its mask (H, W) bool")
     if unknown := sorted(set(masks) - set(objects), key=str):

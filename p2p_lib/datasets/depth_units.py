@@ -9,7 +9,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import DepthConfig
 from p2p_lib.core.depth import depth_noise_m
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import ends_px
 from p2p_lib.core.types import Frame
 
 #: Metres per unit of depth images in the field, likeliest first, and whose they are.
@@ -95,9 +95,7 @@ def odd_size(mask: np.ndarray, away_m: float, camera: Camera, scale: float) -> t
 
     mask  (H, W) bool: how long it is follows from its outline, at the distance away_m: depth is wild at edges
     """
-    rows, columns = bounds(mask)
-    sides_px = np.array([columns.stop - columns.start, rows.stop - rows.start])
-    length_m = float((sides_px / [camera.fx, camera.fy]).max() * away_m)
+    length_m = float((np.ptp(ends_px(mask), 0) / [camera.fx, camera.fy]).max() * away_m)
     if not (length_m < _LONG_M[0] or length_m > _LONG_M[1]):
         return None
     fix = f"If it is not, its mask is of something else, or {_wrong_scale(away_m, scale)}"

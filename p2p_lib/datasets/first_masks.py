@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.colours import object_colours, rgb
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import ends_px
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.images import save_png
@@ -73,7 +73,7 @@ def _panel(
         thick = 1 if np.count_nonzero(mask) < _LARGE_PX else 2
         cv2.drawContours(image, outlines, -1, rgb(colours[name]), thick)
     # Enlarged before anything thick is drawn, so that it covers none of a small object.
-    side_px = {name: int(np.ceil(max(_size_px(mask)) * (1 + 2 * _ROOM))) for name, mask in masks.items()}
+    side_px = {name: int(np.ceil(np.ptp(ends_px(mask), 0).max() * (1 + 2 * _ROOM))) for name, mask in masks.items()}
     least_px = max(_CLOSE_PX, *side_px.values())  # none is smaller than in the frame
     # In a square beside the frame, as high as it, so that nothing is left empty but the end of the last row.
     rows = int(np.ceil(np.sqrt(len(masks))))
@@ -89,18 +89,12 @@ def _panel(
     return np.concatenate([image, beside], 1)
 
 
-def _size_px(mask: np.ndarray) -> tuple[int, int]:
-    """Width and height of what a mask holds."""
-    rows, columns = bounds(mask)
-    return columns.stop - columns.start, rows.stop - rows.start
-
-
 def _close(
     image: np.ndarray, mask: np.ndarray, name: str, prompts: Iterable[Prompt], colour: str, side: int, height_px: int
 ) -> np.ndarray:
     """The square of this ``side`` around one object, enlarged to a height, with its clicks, name and pixels."""
-    rows, columns = bounds(mask)
-    left, top = (np.array([columns.start, rows.start]) + (np.array(_size_px(mask)) - side) // 2).tolist()
+    first, beyond = ends_px(mask)
+    left, top = (first + (beyond - first - side) // 2).tolist()
     around = cv2.copyMakeBorder(image, side, side, side, side, cv2.BORDER_CONSTANT)  # an object at the image's edge
     part = around[top + side : top + 2 * side, left + side : left + 2 * side]
     scale = height_px / side

@@ -142,6 +142,7 @@ class Point2Pose(Savable):
         negative: ArrayLike | None = None,
         box: ArrayLike | None = None,
         *,
+        frame: Frame | None = None,
         memory: ObjectMemory | None = None,
         frozen: bool = False,
     ) -> None:
@@ -156,9 +157,9 @@ class Point2Pose(Savable):
         if memory is None:
             if frozen:
                 raise BadInput("add_object", "frozen without a memory", "a memory, whose map is then kept as it is")
-            super().add_object(name, mask, clicks, negative, box)
+            super().add_object(name, mask, clicks, negative, box, frame=frame)
             return
-        alone = mask is clicks is negative is box is None
+        alone = mask is clicks is negative is box is frame is None
         if not alone or file_name("object name", name) in self.objects:
             got = f"{name!r}, which is in use" if alone else "clicks or a mask, too"
             raise BadInput("add_object with a memory", got, "a new name and the memory alone")

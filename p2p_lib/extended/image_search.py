@@ -7,6 +7,7 @@ which counts less.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -102,6 +103,11 @@ class Sighting:
         return bool(self.share - other.share >= _ERRORS * np.sqrt(variance))
 
 
+def most_shown(found: Iterable[Sighting | None]) -> Sighting | None:
+    """The sighting in which most of the surface shows; None without any."""
+    return max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+
+
 class ImageSearch:
     """One frame, made ready for comparison."""
 
@@ -129,8 +135,7 @@ class ImageSearch:
     ) -> Sighting | None:
         """As :meth:`turned`, the best of those that are turned otherwise than a pose."""
         found = self._turns(turns, cloud, sample)
-        other = [s for s in found if se3.angle_rad(se3.inverse(T_cam_obj) @ s.T_cam_obj) > _APART_RAD]
-        return max(other, key=lambda s: s.share, default=None)
+        return most_shown(s for s in found if se3.angle_rad(se3.inverse(T_cam_obj) @ s.T_cam_obj) > _APART_RAD)
 
     def places(self, free: np.ndarray, sample: SurfaceSample, rng: np.random.Generator) -> np.ndarray:
         """(P, 3) some measured points of ``free`` pixels (H, W) bool where the surface may be.

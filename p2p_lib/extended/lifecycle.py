@@ -33,12 +33,11 @@ TELLING, CLEAR = 0.25, 0.5
 class Lifecycle(Life):
     """The state of one object between two frames.
 
-    In addition to the paper's:
+    In addition to the paper's, of which ``confirming`` counts the frames that still have to confirm a return:
 
     pace_s          time between the newest two frames that followed each other with poses; infinite before
     T_previous      pose of the frame before it; None after a gap
     T_left          newest pose before the absence; an unconfirmed return falls back to it
-    confirming      frames for which a return still has to be confirmed
     T_world_obj     newest pose in the scene that many points agreed with, where the camera was known; None before
     rested          how often in a row it was seen at T_world_obj again
     motion          how it moves, by the confident poses; None before the first

@@ -14,8 +14,8 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import DOUBTED, Status
-from p2p_lib.extended.agreement import scene_ratio
+from p2p_lib.core.types import DOUBTED, Frame, Status
+from p2p_lib.extended.agreement import looks_alike, scene_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
 from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge
@@ -212,8 +212,8 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         best, reason = self._best(obs, known, candidates)
         if best is None:
             return None, reason
-        best = self._held(obs, known, best if best.refined else self.refine(obs, known, best))
-        return self._compared(obs, known, best), reason
+        best = self._without_slip(obs, known, best if best.refined else self.refine(obs, known, best))
+        return self._told_from_turns(obs, known, best), reason
 
     def _best(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
         """The candidate to go on with, and why."""
@@ -243,16 +243,17 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
         return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
-    def _held(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
+    def _without_slip(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a followed object, or another turn in its place under which clearly more of the surface shows.
 
         In a fast turn points slide over the surface, all alike, and agree on a pose that has stayed behind. That is
-        looked for where few keypoints agree; new points do not count, they agree with whatever placed them.
+        looked for where few keypoints agree; new points do not count, they agree with whatever placed them. Over what
+        looks as it did, none slides.
         """
         agree = np.count_nonzero(best.hypothesis.inliers & known.keypoints(obs))
         many = agree >= self.config.lifecycle.return_inliers
         due = not (many or known.life.unconfirmed or obs.mask is None)
-        if not (due and self.shape.knows(known) and "slips" in self.on):
+        if not (due and self.shape.knows(known) and "slips" in self.on) or self._looks_as_before(obs):
             return best
         assert best.refined is not None, "it is refined before it is compared"
         if may_slide(best.refined, self.config.refinement.min_eigenvalue, 2):
@@ -266,7 +267,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         turned = Proposal(Hypothesis(near.T_cam_obj, agrees, residual_m, "surface"))
         return replace(self.refine(obs, known, turned), sighting=near.share, slipped=True)
 
-    def _compared(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
+    def _told_from_turns(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
 
         Repeated now and then until the lead is telling. Where no other turn is known, the keypoints' agreement leads.
@@ -320,23 +321,26 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         near = same_place(place, best.T_cam_obj)
         return near or (None if empty(self.observer, obs.frame, place, known.map.p_obj) else False)
 
-    def _before(self, obs: OurObservation) -> OurObservation | None:
-        """The newest frame without a doubt; None unless both it and this one have a mask."""
+    def _now_and_before(self, obs: OurObservation) -> tuple[Frame, np.ndarray, Frame, np.ndarray] | None:
+        """This frame with its mask, and the newest one without a doubt with its own; None unless both have one."""
         before = self.trusted
-        return None if obs.mask is None or before is None or before.mask is None else before
+        if obs.mask is None or before is None or before.mask is None:
+            return None
+        return obs.frame, obs.mask, before.frame, before.mask
+
+    def _looks_as_before(self, obs: OurObservation) -> bool:
+        """Whether it looks as in the newest frame without a doubt, so that it has not turned since."""
+        views = self._now_and_before(obs)
+        return views is not None and looks_alike(*views)
 
     def _scene_ratio(self, obs: OurObservation) -> float:
         """How far away the resting scene is measured, over what it was in the newest frame without a doubt."""
-        before = self._before(obs)
-        if before is None:
-            return 1.0
-        assert obs.mask is not None and before.mask is not None, "both have one"
-        return scene_ratio(obs.frame, obs.mask, before.frame, before.mask)
+        views = self._now_and_before(obs)
+        return 1.0 if views is None else scene_ratio(*views)
 
     def outline(self, obs: OurObservation) -> float:
         """Share of the mask's outline along depth steps, relative to that in the newest frame without a doubt."""
-        before = self._before(obs)
-        then, now = None if before is None else before.outline_share, obs.outline_share
+        then, now = None if self.trusted is None else self.trusted.outline_share, obs.outline_share
         return 1.0 if then is None or now is None or then < _CLEAR_OUTLINE else now / then
 
     # -- admit and request ---------------------------------------------------------------------

@@ -40,7 +40,8 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
     def save(self, path: str | Path) -> None:
         """Keep what is known of all objects, as plain data, for :meth:`load`; before :meth:`close`.
 
-        Of objects that have not started yet, what is to start them in the next frame: their clicks, box or mask.
+        Of objects that have not started yet, what is to start them in the next frame: their clicks, box or mask, unless
+        these are of an earlier one.
 
         Tracker, detector and segmenter are kept by the names that were asked for, ``package.module:Class`` among them.
         One that was given as an instance is no plain data: :meth:`load` asks for it.
@@ -60,7 +61,8 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
             given = dict(zip(_PARTS, self._made_of[2:], strict=True))
             parts = {kind: part if isinstance(part, str) else [type(part).__name__] for kind, part in given.items()}
             about: dict[str, Any] = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen}
-            waiting = [as_entry(prompt) for name, prompt in self._prompts.items() if name not in learnt]
+            kept = learnt.keys() | self._earlier.keys()
+            waiting = [as_entry(prompt) for name, prompt in self._prompts.items() if name not in kept]
             save_memories(path, learnt, _SAVED, about | {"prompts": waiting, **parts})
 
     @classmethod

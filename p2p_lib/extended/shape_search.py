@@ -14,7 +14,7 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.gates import SIGHTED
-from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample
+from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample, most_shown
 from p2p_lib.extended.model import JoinableModel, OurKnown
 from p2p_lib.extended.observation import OurObservation, cut_off
 from p2p_lib.method.observation import Observer
@@ -60,8 +60,7 @@ class ShapeSearch:
         with self._stopwatch("search"):
             search, sample = self._search(obs.frame), self.sample(known.model)
             own = search.at(T_cam_obj, sample)
-            found = [search.about(T, sample) for T in (T_cam_obj, *priors)]
-            near = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+            near = most_shown([search.about(T, sample) for T in (T_cam_obj, *priors)])
         if own is None or near is None or not near.clearly_above(own):
             return None
         centre = sample.p_obj.mean(0)
@@ -82,7 +81,7 @@ class ShapeSearch:
             found = [search.about(T_cam_obj, self.sample(model)) for T_cam_obj in proposed]
             if obs.mask is not None and life.lost_frames % _TURN_EVERY == 1 and not cut_off(self.observer, obs):
                 found.append(self._turned(obs, known, search))
-            best = max((s for s in found if s is not None), key=lambda s: s.share, default=None)
+            best = most_shown(found)
             return best if best is not None and best.share >= SIGHTED else None
 
     def otherwise(self, obs: OurObservation, known: OurKnown, T_cam_obj: np.ndarray) -> tuple[Sighting | None, ...]:

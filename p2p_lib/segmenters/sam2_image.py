@@ -28,8 +28,6 @@ SIDE, MASK_SIDE = 1024, 256
 _MEAN, _DEVIATION = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
 #: What a point says, as the network numbers it: it is on the object, beside it, a corner of the box around it.
 _ON, _BESIDE, _CORNERS = 1, 0, [2, 3]
-#: A mask that is handed to the network, as logits: as sure as its own are.
-_SURE = 8.0
 
 
 class Session(Protocol):
@@ -113,23 +111,16 @@ class Sam2Image:
         image = np.ascontiguousarray(((image - _MEAN) / _DEVIATION).transpose(2, 0, 1)[None])
         return Features(dict(zip(self._names, self._encoder.run(None, {"image": image}))), shape)
 
-    def candidates(self, features: Features, prompt: Prompt, mask: np.ndarray | None = None) -> MaskCandidates:
-        """What a prompt's clicks and box, of which there is one at least, make of an image.
-
-        mask  (H, W) bool: about where the object is, which the network mends; None where nobody says
-        """
+    def candidates(self, features: Features, prompt: Prompt) -> MaskCandidates:
+        """What a prompt's clicks and box, of which there is one at least, make of an image."""
         corners = np.zeros((0, 2)) if prompt.box_px is None else prompt.box_px.reshape(2, 2)
         at = np.concatenate([corners, prompt.points_px, prompt.negative_px])
         kinds = _CORNERS[: len(corners)] + [_ON] * len(prompt.points_px) + [_BESIDE] * len(prompt.negative_px)
-        before = np.zeros((MASK_SIDE, MASK_SIDE), np.float32)
-        if mask is not None:
-            share = cv2.resize(mask.astype(np.float32), (MASK_SIDE, MASK_SIDE), interpolation=cv2.INTER_AREA)
-            before = _SURE * (2 * share - 1)
         inputs = {
             "point_coords": to_raster(at, features.shape, SIDE).astype(np.float32)[None],
             "point_labels": np.array(kinds, np.float32)[None],
-            "mask_input": before[None, None],
-            "has_mask_input": np.array([mask is not None], np.float32),
+            "mask_input": np.zeros((1, 1, MASK_SIDE, MASK_SIDE), np.float32),
+            "has_mask_input": np.zeros(1, np.float32),
         }
         logits, score = self._decoder.run(None, features.arrays | inputs)
         return MaskCandidates(logits[0], score[0], features.shape)

@@ -31,6 +31,8 @@ from p2p_lib.synthetic.faults import Faulty
 from tests.fixtures.late_depth import film
 
 CAMERA = open_sequence("synthetic/crossing").camera
+#: For runs that are asked for what they say at the start alone: a surface of something five times as large is slow.
+POINTS_ALONE = {"method.surface": False, "method.graph": False}
 
 
 def another_K(sequence, K):
@@ -144,7 +146,8 @@ def test_an_embedded_sequence_raises_no_alarm():
 def test_a_run_says_that_depth_is_not_registered_too(good, tmp_path):
     said = "offset from colour: .* Register depth to colour when recording"
     with pytest.warns(Doubt, match=said):
-        result = run(Faulty(open_sequence(good), "depth not registered"), tmp_path / "run", progress=False)
+        source = Faulty(open_sequence(good), "depth not registered")
+        result = run(source, tmp_path / "run", settings=POINTS_ALONE, progress=False)
     assert [re.search(said, line) is not None for line in result.look_at].count(True) == 2  # of each object
 
 
@@ -437,7 +440,7 @@ def test_a_run_says_at_its_first_masks_that_depth_is_out_of_range(good, tmp_path
     folder = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), factor)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run(folder, tmp_path / "run", masks=masks, stop=1, progress=False)
+        run(folder, tmp_path / "run", masks=masks, stop=1, settings={"tsdf.voxel_m": 0.02}, progress=False)
     followed = [obj.has_pose.all() for obj in load_run(tmp_path / "run").objects.values()]
     assert followed == [factor in (1, 5)] * 2, "what is far away is followed, too"
     said = [str(doubt.message) for doubt in caught if " m away" in str(doubt.message)]
@@ -457,7 +460,7 @@ def test_a_mask_that_holds_more_of_what_is_far_behind_tells_nothing_of_units(goo
     on_it = np.argwhere(open_sequence(good).masks(0)["box"])
     depth[tuple(on_it[: int(share * len(on_it))].T)] = 6000
     cv2.imwrite(str(folder / "depth/000000.png"), depth)
-    run(folder, tmp_path / "run", objects=["box"], stop=1, progress=False)
+    run(folder, tmp_path / "run", objects=["box"], stop=1, settings=POINTS_ALONE, progress=False)
     assert any("m count" in str(doubt.message) for doubt in recwarn) == doubted
 
 
@@ -493,7 +496,7 @@ def test_a_wrong_unit_shows_in_an_objects_size_where_its_distance_may_be(good, t
     assert "--depth-scale). A unit of" in finding.fix
     assert "box: size" not in [f.name for f in check_folder(good, **wide)]
     for sizes, doubted in (({}, True), ({"box": 60}, False)):
-        settings = {"depth.min_m": 0.01, "depth.max_m": 10.0}
+        settings = {"depth.min_m": 0.01, "depth.max_m": 10.0} | POINTS_ALONE
         run(scaled, tmp_path / f"{doubted}", objects=["box"], stop=1, settings=settings, sizes=sizes, progress=False)
         said = f"{'size' if times < 1 else 'depth'} of 'box' in frame 0"
         assert any(said in str(doubt.message) for doubt in recwarn) == doubted
@@ -638,12 +641,12 @@ def test_one_that_is_far_away_beside_others_is_and_needs_no_other_unit(good, tmp
         depth[mask] = np.clip(4.0 * depth[mask], 0, 4000)
         cv2.imwrite(str(path), depth)
     assert found(folder, "can: depth").level is Level.OK
-    run(folder, tmp_path / "run", stop=1, progress=False)
+    run(folder, tmp_path / "run", stop=1, settings=POINTS_ALONE, progress=False)
     assert not any(" m away, where depth" in str(doubt.message) for doubt in recwarn)
 
 
 def test_of_all_that_are_far_away_one_is_judged_and_a_known_size_says_that_they_are(good, tmp_path, recwarn):
     folder = scaled_depth(shutil.copytree(good, tmp_path / "scaled"), 5)
     assert [f.name for f in check_folder(folder) if f.name.endswith(": depth")] == ["box: depth"]
-    run(folder, tmp_path / "run", stop=1, sizes={"box": 100.0}, progress=False)
+    run(folder, tmp_path / "run", stop=1, sizes={"box": 100.0}, settings=POINTS_ALONE, progress=False)
     assert not any(" m away, where depth" in str(doubt.message) for doubt in recwarn)

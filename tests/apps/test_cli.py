@@ -310,7 +310,8 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert contents(out) == before
 
 
-def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys):
+def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys, here):
+    here()
     (shelf := tmp_path / "shelf").mkdir()
     shutil.move(sequence, shelf / "one")
     words = ["run", "--batch", str(shelf), "--out", str(tmp_path / "out"), "--jobs", "1", *POINTS_ALONE]
@@ -449,7 +450,7 @@ def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence,
     assert re.match(said, json.loads((tmp_path / "out/run.json").read_text())["doubts"][0])
 
 
-def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys):
+def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys, monkeypatch):
     (sequence / "depth/0002.png").unlink()
     assert run(sequence, tmp_path / "run") == 2
     assert "0002.png is missing. p2p run --skip-bad goes on" in capsys.readouterr().err
@@ -466,6 +467,12 @@ def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(seque
     assert list(kept.info["left_out"]) == ["2"] and "0002.png" in kept.info["left_out"]["2"]
     assert cli.main(["eval", str(tmp_path / "run")]) == 0
     assert cli.main(["film", str(tmp_path / "run"), "--out", str(tmp_path / "film.webp")]) == 0
+    assert cli.main(["export", str(tmp_path / "run"), "--format", "tum", "--out", str(tmp_path / "tum")]) == 0
+    assert len(np.loadtxt(tmp_path / "tum/object.txt")) == 7
+    monkeypatch.setattr("p2p_lib.apps.click.wait_for_clicks", lambda page, *_: page.prompts)
+    click = ["click", str(sequence), "--out", str(tmp_path / "prompts.json")]
+    assert cli.main([*click, "--run", str(tmp_path / "run")]) == 0, "what the run left out, it can be corrected without"
+    assert cli.main(click) == 2
     assert run(sequence, tmp_path / "run", "--skip-bad", "--save-masks", "--resume") == 0
 
 

@@ -25,7 +25,7 @@ import trimesh
 from p2p_lib.apps import cli
 from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_click import LiveClicker
-from p2p_lib.apps.live_words import Words, outlet
+from p2p_lib.apps.live_words import KEPT, Words, outlet
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.config import preset
@@ -642,9 +642,12 @@ def test_what_was_learnt_of_an_object_is_kept_when_it_is_removed(folder, tmp_pat
     assert not [text for text in found.look_at() if "found again" in text or "no mask and no pose" in text]
 
 
-def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
-    """The page shows the frame that was tracked last; what is sent from there is of the next one."""
-    sequence, errors = open_sequence(folder), []
+def test_objects_are_clicked_on_while_it_runs(tmp_path):
+    """The page shows the frame that was tracked last; what is sent from there is of that, as long as nothing moves."""
+    folder, errors = write_sequence(tmp_path / "slide", FRAMES), []
+    for kind in ("rgb", "depth"):
+        shutil.copy(folder / kind / "0001.png", folder / kind / "0002.png")
+    sequence = open_sequence(folder)
     words = Words(None, errors.append)
     answers = {}
 
@@ -696,10 +699,14 @@ def test_objects_are_clicked_on_while_it_runs(folder, tmp_path):
 
 
 class Told(list):
-    """In the place of a tracker: the prompts that it is told."""
+    """In the place of a tracker: the prompts that it is told, and the frames that they are of."""
 
-    def tell(self, prompt):
+    def __init__(self):
+        self.of = []
+
+    def tell(self, prompt, frame):
         self.append(prompt)
+        self.of.append(frame)
 
 
 def test_clicks_are_of_the_image_that_is_shown(folder):
@@ -715,15 +722,15 @@ def test_clicks_are_of_the_image_that_is_shown(folder):
         shown = page.masks(click | {"frame": 0})["masks"]["board"]
         page.see(same, {})
         assert page.save(click) == ""
-        assert [prompt.frame for prompt in words.tell(told, 4)] == [4]
-        assert run_lengths(told[0].mask)["counts"] == shown
+        assert [prompt.frame for prompt in words.tell(told, picture(4))] == [4]
+        assert run_lengths(told[0].mask)["counts"] == shown and told.of == [first], "it is looked at once more"
         page.see(later, {})
         assert page.save(click) == "The image has moved on at board: click again."
         page.session()
         with pytest.raises(BadInput, match="frame 6, the one that is shown"):
             page.save(click)
         assert page.save({"objects": [{"name": "board", "frame": 6, "points": [[76, 58]]}]}) == ""
-        assert len(words.tell(told, 7)) == 1
+        assert len(words.tell(told, picture(7))) == 1
 
 
 def test_a_correction_is_of_the_image_that_is_shown(folder):
@@ -740,11 +747,11 @@ def test_a_correction_is_of_the_image_that_is_shown(folder):
             {"name": "wall", "frame": 0, "negative": [[5, 5]]},
         ]
         assert page.save({"objects": said}) == "The image has moved on at board: click again."
-        words.tell(told, 10)
+        words.tell(told, picture(10))
         assert [(prompt.name, prompt.negative_px.tolist()) for prompt in told] == [("wall", [[5, 5]])]
         page.session()
         box = {"name": "board", "frame": 9, "box": [30, 20, 130, 110]}
-        assert page.save({"objects": [box]}) == "" and words.tell(told, 11)[0].box_px is not None
+        assert page.save({"objects": [box]}) == "" and words.tell(told, picture(11))[0].box_px is not None
 
 
 def test_clicks_that_select_nothing_are_refused_on_the_page(folder, monkeypatch):
@@ -781,7 +788,7 @@ def test_whoever_is_to_say_something_is_told_when_and_how(folder, capsys, monkey
     said = Words(None, print)
     said.hear(shown[0].replace("[x, y], ...", "[60, 50]"))
     said.hear(shown[2])
-    assert [(name, prompt is None) for name, prompt in said._pending] == [("mug", False), ("mug", True)]
+    assert [(name, prompt is None) for name, prompt, _ in said._pending] == [("mug", False), ("mug", True)]
     assert cli.main([*words, "--click", "--no-browser"]) == 0
     assert "standard input" not in capsys.readouterr().err
 
@@ -806,7 +813,7 @@ def test_words_that_do_not_fit_are_said_and_change_nothing():
         lines.typed.put(None)
         while lines.typed.qsize() or len(errors) < 3:
             time.sleep(0.001)
-        assert words.tell(method, 3) == [] and not method.objects
+        assert words.tell(method, picture(3)) == [] and not method.objects
     said = "\n".join(errors)
     for part in (
         "line: got hello",
@@ -1042,11 +1049,23 @@ def test_images_after_the_stop_push_none_out(folder, backlog, kept, monkeypatch)
     assert (count.frames, count.dropped) == (len(kept), 8 - len(kept))
 
 
-def test_a_line_may_have_the_frame_of_a_file_of_clicks_which_means_nothing():
-    words, errors = Words(None, print), []
-    words.hear('{"name": "mug", "frame": 40, "points": [[60, 50]]}')
-    with Point2Pose(Camera.from_K(K, W, H)) as method:
-        assert [prompt.frame for prompt in words.tell(method, 3)] == [3] and not errors
+def test_a_line_may_name_the_frame_that_it_is_of():
+    """One that was tracked a while ago: it is kept. One that was not, or long ago, is refused."""
+    errors, told, line = [], Told(), '{"name": "mug", "frame": %d, "points": [[60, 50]]}'
+    words, frames = Words((), errors.append), [picture(2 * k) for k in range(KEPT + 1)]
+    for said, frame in zip(("", line % 0, line % 0, line % 1, line.replace(' "frame": %d,', "")), frames):
+        words.hear(said)
+        words.tell(told, frame)
+    assert [(prompt.frame, of) for prompt, of in zip(told, told.of)] == [(2, frames[0]), (4, frames[0]), (8, None)]
+    for frame in frames[5:]:
+        words.tell(told, frame)
+    words.hear('{"objects": [%s]}' % (line % 0))
+    words.hear(line % 2)
+    words.tell(told, picture(999))
+    assert told.of[3:] == [frames[1]]
+    for k, error in zip((1, 0), errors, strict=True):
+        why = f"got frame {k}, expected one of the last {KEPT} that were tracked. Click on a newer image"
+        assert error.startswith(f"prompt of 'mug': {why}")
 
 
 def test_a_run_of_a_folder_with_models_can_be_scored(folder, tmp_path, capsys):

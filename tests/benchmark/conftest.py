@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from p2p_lib.benchmark import run_benchmarks
+from tests.fixtures.runs_here import in_this_process
 from tests.fixtures.sliding_board import write_sequence
 
 PLAN = """
@@ -40,7 +42,7 @@ def plan(slides, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def whole(plan, tmp_path_factory):
-    """The plan in full, run at once."""
-    from p2p_lib.benchmark import run_benchmarks
-
-    return run_benchmarks([plan], tmp_path_factory.mktemp("whole"), progress=False, jobs=2)[0]
+    """The plan in full, run at once, in this process: what others make of it in processes of their own is the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("p2p_lib.benchmark.benchmark.execute", in_this_process)
+        return run_benchmarks([plan], tmp_path_factory.mktemp("whole"), progress=False)[0]

@@ -26,18 +26,20 @@ def shelf(tmp_path):
     return folder
 
 
-def test_every_recording_has_a_row_and_is_run_once(shelf, tmp_path):
+def test_every_recording_has_a_row_and_is_run_once(shelf, tmp_path, here):
     table = run_batch(shelf, tmp_path / "out", OPTIONS, jobs=1)
     assert table["recording"].tolist() == ["broken", "one", "two"]
     assert table["pose [%]"].tolist()[1:] == [100, 100]
     assert "files, expected" in table["note"][0] and pd.isna(table["object"][0])
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "out/batch.csv"), table, check_dtype=False)
     written = (tmp_path / "out/one/poses.npz").stat().st_mtime_ns
+    here()
     run_batch(shelf, tmp_path / "out", OPTIONS, jobs=1)
     assert (tmp_path / "out/one/poses.npz").stat().st_mtime_ns == written
 
 
-def test_a_recording_that_cannot_be_run_is_a_failure_and_the_table_is_there(shelf, tmp_path, capsys):
+def test_a_recording_that_cannot_be_run_is_a_failure_and_the_table_is_there(shelf, tmp_path, capsys, here):
+    here()
     words = ["run", "--batch", str(shelf), "--out", str(tmp_path / "out"), "--jobs", "1", "--quiet"]
     words += ["--set", "method.surface=false", "--set", "method.graph=false"]
     assert cli.main(words) == 2
@@ -48,7 +50,8 @@ def test_a_recording_that_cannot_be_run_is_a_failure_and_the_table_is_there(shel
     assert cli.main(words) == 0
 
 
-def test_failures_of_what_runs_now_or_is_gone_do_not_stay_and_other_folders_are_named(shelf, tmp_path):
+def test_failures_of_what_runs_now_or_is_gone_do_not_stay_and_other_folders_are_named(shelf, tmp_path, here):
+    here()
     (shelf / "two/prompts.json").write_text("{}")
     shutil.copytree(shelf / "two", shelf / "three")
     out, failures, said = tmp_path / "out", tmp_path / "out/failures", []

@@ -21,7 +21,7 @@ import pytest
 from p2p_lib.apps import cli
 from p2p_lib.benchmark import Plan, read_plan, run_benchmarks
 from p2p_lib.benchmark.benchmark import Benchmark
-from p2p_lib.benchmark.execution import perform
+from p2p_lib.benchmark.execution import execute, perform
 from p2p_lib.benchmark.jobs import jobs_of, library_version
 from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome, load_outcome, save_outcome
 from p2p_lib.core.errors import BadInput, Doubt, MissingBackend
@@ -89,10 +89,11 @@ def test_mean_and_pool_are_those_of_the_runs(whole):
     assert number(rows, **pooled) == pytest.approx(metrics.auc_voc(np.concatenate(errors)))
 
 
-def test_frames_in_which_too_little_is_to_be_seen_are_left_out(plan, tmp_path):
+def test_frames_in_which_too_little_is_to_be_seen_are_left_out(plan, tmp_path, here):
+    here()
     path = tmp_path / "slides.toml"
     path.write_text("min_mask_px = 1_000_000\n" + plan.read_text())
-    found = run_benchmark(path, tmp_path / "out", profile="quick", progress=False, jobs=1)
+    found = run_benchmark(path, tmp_path / "out", profile="quick", progress=False)
     assert all("1000000 visible pixels" in outcome.reason for _, outcome in found.results)
     for kind in ("methods", "returns", "runs", "grid", "pairs"):
         shown = replace(found, plan=found.plan.model_copy(update={"kind": kind}))
@@ -172,7 +173,7 @@ def test_methods_that_need_a_gpu_share_it_as_the_plan_says(plan, tmp_path, monke
 # --- whatever ends it ----------------------------------------------------------------------------
 
 
-def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path):
+def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path, here):
     command = [sys.executable, "-m", "p2p_lib.apps.cli", "benchmark", str(plan), "--out", str(tmp_path), "--jobs", "1"]
     killed = subprocess.Popen([*command, "--quiet"], stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
@@ -183,13 +184,14 @@ def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path
     kept = {path: path.read_bytes() for path in (tmp_path / "records").glob("*.json")}
     assert 2 <= len(kept) < 8, "it was killed on the way"
     assert not (tmp_path / "slides-full").exists()
-    done = run_benchmark(plan, tmp_path, progress=False, jobs=2)
+    here()
+    done = run_benchmark(plan, tmp_path, progress=False)
     assert {path: path.read_bytes() for path in kept} == kept, "what was done stays as it was"
     assert (done.folder / "results.csv").read_bytes() == (whole.folder / "results.csv").read_bytes()
     assert (done.folder / "summary.csv").read_bytes() == (whole.folder / "summary.csv").read_bytes()
 
 
-def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path, capsys):
+def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path, capsys, here):
     broken = Path(shutil.copytree(slides[0], tmp_path / "broken"))
     (broken / "rgb/0004.png").write_bytes(b"no picture")
     text = plan.read_text().replace("seeds = [0, 1]", "seeds = [0]").replace(str(slides[1]), str(broken))
@@ -200,6 +202,7 @@ def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path, cap
     failed = [row for row in rows if row["metric"] == "failed"]
     assert len(failed) == 2 and all("0004.png" in row["reason"] and row["value"] == "" for row in failed)
     again = ["benchmark", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "out"), "--quiet"]
+    here()
     assert cli.main(again) == 2 and "2 runs failed; the tables say why" in capsys.readouterr().err
     ours = {"method": "Ours", "seed": 0}
     alone = number(rows, **EXACT, **ours, sequence=str(slides[0]))
@@ -233,13 +236,14 @@ def darker(folder, masks):
 """
 
 
-def test_a_sequence_of_ones_own_layout_is_run_by_its_loader(plan, slides, tmp_path, monkeypatch):
+def test_a_sequence_of_ones_own_layout_is_run_by_its_loader(plan, slides, tmp_path, monkeypatch, here):
+    here()
     (tmp_path / "mine_of_a_plan.py").write_text(LOADER)
     monkeypatch.syspath_prepend(str(tmp_path))
     shutil.copytree(slides[0], tmp_path / "own/inside")
     text = plan.read_text().replace(f'name = "{slides[0]}"', f'name = "{tmp_path}/own", format = "mine_of_a_plan:load"')
     (tmp_path / "own.toml").write_text(text)
-    done = run_benchmark(tmp_path / "own.toml", tmp_path / "out", "quick", progress=False, jobs=1)
+    done = run_benchmark(tmp_path / "own.toml", tmp_path / "out", "quick", progress=False)
     assert done.counts() == {"done": 2, "failed": 0, "not run": 0}
     assert number(table(done), **EXACT, method="Ours", sequence=f"{tmp_path}/own", object="object") > 50
     assert done.run("Ours").info["format"] == "mine_of_a_plan:load" and len(done.video("Ours")) == 6
@@ -251,7 +255,7 @@ def test_a_sequence_of_ones_own_layout_is_run_by_its_loader(plan, slides, tmp_pa
     assert all("Give a folder that is in it" in reason for reason in reasons), "of itself it is no recording"
 
 
-def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp_path):
+def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp_path, here):
     def kill_the_first() -> None:
         while not (found := [p for p in multiprocessing.active_children() if p.pid]):
             time.sleep(0.001)
@@ -262,6 +266,7 @@ def test_a_run_whose_process_dies_fails_alone_and_is_retried_on_demand(plan, tmp
     assert done.counts() == {"done": 1, "failed": 1, "not run": 0}
     (reason,) = (outcome.reason for _, outcome in done.results if outcome.status == "failed")
     assert "its process was ended" in reason
+    here()
     assert run_benchmark(plan, tmp_path, "quick", progress=False).counts()["failed"] == 1, "not without being told"
     assert run_benchmark(plan, tmp_path, "quick", progress=False, retry=True).counts()["done"] == 2
 
@@ -373,7 +378,7 @@ def test_figures_that_are_not_known_are_refused_before_anything_runs(tmp_path, c
 
 def test_a_cluster_finds_the_same_table(whole, plan, tmp_path, capsys):
     distributed = pytest.importorskip("distributed", reason="extra dask is not installed")
-    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
     with cluster:
         address = cluster.scheduler_address
         assert address.startswith("tcp://")
@@ -398,13 +403,13 @@ def test_without_distributed_it_says_what_to_install(plan, tmp_path, monkeypatch
         run_benchmark(plan, tmp_path, "quick", scheduler="tcp://127.0.0.1:9", progress=False)
 
 
-def test_what_dead_processes_left_is_swept(plan, tmp_path):
+def test_what_dead_processes_left_is_swept(tmp_path):
     left = tmp_path / "runs" / f".abc.{platform.node()}.999999999"
     running = tmp_path / "runs" / f".abc.{platform.node()}.{os.getpid()}"
     elsewhere = tmp_path / "runs" / ".abc.another-machine.999999999"
     for folder in (left, running, elsewhere):
         folder.mkdir(parents=True)
-    run_benchmark(plan, tmp_path, "quick", progress=False)
+    assert not list(execute([], tmp_path, 1, None))
     assert not left.exists() and running.exists() and elsewhere.exists()
 
 
@@ -419,13 +424,14 @@ def test_a_record_with_lost_frames_is_read_back_as_it_was(tmp_path):
     assert np.isinf(again.objects["box"].errors_m("first")["add_m"][1])
 
 
-def test_every_sequence_is_run_with_every_fault_and_a_row_says_what_it_did(slides, plan, tmp_path):
+def test_every_sequence_is_run_with_every_fault_and_a_row_says_what_it_did(slides, plan, tmp_path, here):
+    here()
     known = read_plan(plan)
     scaled = {"name": "depth scaled", "severity": 1.3, "when": "at first"}
     scope = {"seeds": [0], "sequence": [{"name": str(slides[0]), "fault_frames": [3, 5]}]}
     scope["fault"] = [{"name": "none"}, scaled, {"name": "frames dropped"}]
     faults = Plan(name="f", title="Faults", kind="faults", method=known.method[:1], quick=scope, full=scope)
-    run = run_benchmark(faults, tmp_path / "out", "quick", jobs=1, progress=False)
+    run = run_benchmark(faults, tmp_path / "out", "quick", progress=False)
     assert run.counts() == {"done": 3, "failed": 0, "not run": 0}
     known = {row["sequence"].partition(" with ")[2] for row in run.rows if row["metric"] == "fault"}
     assert known >= {"none", "depth scaled, 1.3, at first", "frames dropped"}

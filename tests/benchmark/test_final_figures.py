@@ -78,7 +78,13 @@ def test_results_in_full_are_shown_and_the_quick_form_runs_where_there_are_none(
     assert quick.profile == "quick" and quick.counts()["done"] == 2
 
 
-def test_plans_that_share_runs_share_them_in_one_call(plan, tmp_path):
+def test_an_image_is_of_the_first_plan_that_was_run(whole, plan, tmp_path):
+    results = {"not run": load_benchmark(plan, tmp_path), "run": whole, "run too": load_benchmark(plan, whole.out)}
+    assert final_figures.first_with_runs(results, "not run", "run", "run too") is whole
+
+
+def test_plans_that_share_runs_share_them_in_one_call(plan, tmp_path, here):
+    here()
     twin = read_plan(plan).model_copy(update={"name": "twin"})
     one, two = run_benchmarks([plan, twin], tmp_path, "quick", progress=False)
     assert one.counts() == two.counts() == {"done": 2, "failed": 0, "not run": 0}

@@ -12,6 +12,7 @@ import pytest
 
 from p2p_lib.core.compiled import LOOPS, LOOPS_IN_BACKGROUND, uninterrupted, warm_up
 from p2p_lib.core.paths import PROJECT
+from p2p_lib.datasets.runs import load_run
 
 FILE = '''
 import numpy as np
@@ -38,11 +39,11 @@ print('numba' in sys.modules, loops.square.__doc__, *ThreadPoolExecutor(2).map(l
 
 @pytest.fixture
 def ask(tmp_path):
-    def ask(**environment):
+    def ask(code=CODE, **environment):
         (tmp_path / "loops.py").write_text(FILE)
         paths = os.pathsep.join([str(tmp_path), *sys.path])
         surroundings = {**os.environ, "PYTHONPATH": paths, **environment}
-        ran = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, env=surroundings)
+        ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=surroundings)
         assert not ran.returncode, ran.stderr
         return ran.stdout.strip()
 
@@ -52,6 +53,14 @@ def ask(tmp_path):
 def test_a_function_is_compiled_once_when_it_is_called_and_kept(ask, tmp_path):
     assert ask() == "False Of x. 5.0 5.0"
     assert list((tmp_path / "__pycache__").glob("loops.norm*.nbc"))
+
+
+def test_what_was_made_ready_is_there_for_who_calls_it_in_another_process(ask, tmp_path):
+    ask("import loops; from p2p_lib.core import compiled; compiled._ready('loops')")
+    (kept,) = (tmp_path / "__pycache__").glob("loops.norm*.nbc")
+    before = kept.stat().st_mtime_ns
+    assert ask() == "False Of x. 5.0 5.0"
+    assert list(kept.parent.glob("loops.norm*.nbc")) == [kept] and kept.stat().st_mtime_ns == before
 
 
 def test_it_runs_where_nothing_can_be_written(ask):
@@ -130,25 +139,28 @@ def timed(*args):
 
 
 p2p_lib.Point2Pose.step = timed
-for sequence, options in (("crossing", {"stop": 96}), ("other_side", {"start": 60, "stop": 130})):
-    run(f"synthetic/{sequence}", f"{sys.argv[1]}/{sequence}", masks="first", progress=False, **options)
+for n, (sequence, stop) in enumerate((("synthetic/crossing", 30), (sys.argv[2], None))):
+    run(sequence, f"{sys.argv[1]}/{n}", masks=("first", "dataset")[n], progress=False, stop=stop)
 print([key for key, now in known().items() if now != ready[key]], [name for _, name in declared if not calls[name]])
 print(*slowest_s)
 """
 AGAIN = "import p2p_lib; said = []; p2p_lib.warm_up(said.append); print(p2p_lib.__file__, len(said))"
 
 
-def test_once_warmed_up_nothing_is_compiled_or_loaded_in_any_frame(tmp_path):
+def test_once_warmed_up_nothing_is_compiled_or_loaded_in_any_frame(tmp_path, opening):
     """With absences, returns, the scene's search and a second map, which call every function that is declared.
 
     And no step takes above a second: of processor time, since other programs may keep both cores. A function that is
     compiled in one takes several.
     """
-    ran = subprocess.run([sys.executable, "-c", WARM, str(tmp_path)], capture_output=True, text=True)
+    turning = opening("other_side", range(60, 216, 4))
+    words = [sys.executable, "-c", WARM, str(tmp_path), str(turning.path)]
+    ran = subprocess.run(words, capture_output=True, text=True)
     assert not ran.returncode, ran.stderr
     late, slowest_s = ran.stdout.strip().splitlines()
     assert late == "[] []"
     assert 0 < float(slowest_s) <= 1
+    assert load_run(tmp_path / "1", every_map=True).objects["box"].map_id.max() == 1, "and a second map was begun"
 
 
 def test_what_is_missing_is_compiled_again_and_said(tmp_path):
@@ -156,7 +168,7 @@ def test_what_is_missing_is_compiled_again_and_said(tmp_path):
     warm_up()
     copy = shutil.copytree(PROJECT / "p2p_lib", tmp_path / "p2p_lib")
     surroundings = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    for lost, lines in ((), 0), ((LOOPS[-1],), 1), ((), 0), ((LOOPS_IN_BACKGROUND[-1],), 1):
+    for lost, lines in ((), 0), ((LOOPS[1],), 1), ((), 0), ((LOOPS_IN_BACKGROUND[-1],), 1):
         for module in lost:
             places = [file for file in copy.rglob("*.nbi") if file.name.startswith(module.rpartition(".")[2] + ".")]
             assert places

@@ -63,7 +63,6 @@ class Runs:
         return self.how
 
 
-TRACE = "p2p_pickle_attack"
 ATTACKS = {
     "os.system": lambda where: Runs(os.system, f"touch {where}"),
     "eval": lambda where: Runs(eval, f"open({str(where)!r}, 'w')"),

@@ -15,7 +15,7 @@ from p2p_lib.evaluation.protocol import evaluate
 from p2p_lib.evaluation.readings import doubt_reading
 
 N = 150
-POINTS = np.random.default_rng(3).normal(0, [0.03, 0.05, 0.1], (700, 3))
+POINTS = np.random.default_rng(3).normal(0, [0.03, 0.05, 0.1], (200, 3))
 
 
 def path(rng, turn_rad=0.03, shift_m=0.005):

@@ -1266,17 +1266,34 @@ def test_of_something_flat_that_shows_more_elsewhere_points_are_believed(loosest
     free = np.sort(best.refined.eigenvalues)
     free[:loosest] = 0
     loose = replace(best, refined=replace(best.refined, eigenvalues=free, free_rotations=np.zeros((0, 6))))
-    assert policy._held(obs, known, loose).slipped == (loosest == 1)
-    assert not policy._held(replace(obs, mask=None), known, best).slipped
+    assert policy._without_slip(obs, known, loose).slipped == (loosest == 1)
+    assert not policy._without_slip(replace(obs, mask=None), known, best).slipped
     returning = replace(known, life=replace(known.life, confirming=2))
-    assert not policy._held(obs, returning, best).slipped, (
+    assert not policy._without_slip(obs, returning, best).slipped, (
         "a return is compared with other turns, not with those nearby"
     )
     for share in (0.45, 0.55):
         monkeypatch.setattr(
             policy.shape, "turned_near", lambda *_, share=share: Sighting(START, share, np.zeros((0, 2)))
         )
-        assert policy._held(obs, known, best).slipped == (share > 0.5), "half of the surface has to show"
+        assert policy._without_slip(obs, known, best).slipped == (share > 0.5), "half of the surface has to show"
+
+
+def in_speckles(lump: Lump, obs, rests: bool):
+    """The observation, and the frame before it, in speckles that rest or move by three pixels."""
+    rgb, policy = np.random.default_rng(0).integers(0, 255, obs.frame.rgb.shape).astype(np.uint8), lump.tracker.policy
+    policy.trusted = replace(policy.trusted, frame=replace(policy.trusted.frame, rgb=rgb))
+    return replace(obs, frame=replace(obs.frame, rgb=rgb if rests else np.roll(rgb, 3, 1)))
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_points_do_not_slide_over_what_looks_as_it_did(rests, monkeypatch):
+    lump = settled(begun(), range(2, 40, 2))
+    policy, known = lump.tracker.policy, lump.tracker.known
+    obs = in_speckles(lump, lump.observed(turned(38), slid(lump, turned(38), 4)), rests)
+    best, _ = policy._best(obs, known, [policy.refine(obs, known, Proposal(h)) for h in policy.propose(obs, known)])
+    monkeypatch.setattr(policy.shape, "turned_near", lambda *_: Sighting(faster(12), 0.9, np.zeros((0, 2))))
+    assert policy._without_slip(obs, known, best).slipped == (not rests)
 
 
 @pytest.mark.parametrize(("moved_m", "deg", "taken"), [(0, 15, True), (0, 5, False), (0.03, 15, False)])

@@ -79,7 +79,7 @@ def test_a_part_that_was_an_instance_is_asked_for(saved, tmp_path):
 
 
 def test_what_is_to_start_an_object_is_kept(tmp_path):
-    """A tracker that is saved before its first frame; a correction of a mask is of no use another day."""
+    """A tracker that is saved before its first frame; no correction of a mask, and nothing said of an earlier frame."""
     mask = np.zeros((240, 320), bool)
     mask[40:90, 50:120] = True
     with Point2Pose(CAMERA) as method:
@@ -87,12 +87,14 @@ def test_what_is_to_start_an_object_is_kept(tmp_path):
         method.add_object("can", box=[200, 50, 260, 120])
         method.add_object("tin", mask=mask)
         method.add_object("later")
+        image = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), np.ones((240, 320), np.float32))
+        method.add_object("seen", clicks=[[220, 200]], frame=image)
         method.add_object("ball", memory=made_memory())
         method.correct("ball", clicks=[[300, 200]])
         method.save(tmp_path / "tracker.npz")
     with Point2Pose.load(tmp_path / "tracker.npz") as loaded:
         kept = loaded._prompts
-        assert [*loaded.objects] == ["cup", "can", "tin", "later", "ball"] and {*kept} == {"cup", "can", "tin"}
+        assert [*loaded.objects] == ["cup", "can", "tin", "later", "seen", "ball"] and {*kept} == {"cup", "can", "tin"}
         assert kept["cup"].points_px.tolist() == [[100, 90], [110, 95]]
         assert kept["cup"].negative_px.tolist() == [[20, 20]] and kept["can"].box_px.tolist() == [200, 50, 260, 120]
         np.testing.assert_array_equal(kept["tin"].mask, mask)

@@ -86,8 +86,8 @@ def test_a_reset_forgets_the_objects_of_a_segmenter_that_was_given():
 
 def test_what_an_object_is_told_by_is_named_and_nothing_else_is_taken():
     told = ["mask", "clicks", "negative", "box"]
-    assert list(signature(Point2Pose.add_object).parameters) == ["self", "name", *told, "memory", "frozen"]
-    assert list(signature(Point2Pose.correct).parameters) == ["self", "name", *told]
+    assert list(signature(Point2Pose.add_object).parameters) == ["self", "name", *told, "frame", "memory", "frozen"]
+    assert list(signature(Point2Pose.correct).parameters) == ["self", "name", *told, "frame"]
     with Point2Pose(CAMERA, quick()) as method:
         with pytest.raises(TypeError, match=r"add_object\(\) got an unexpected keyword argument 'klicks'"):
             method.add_object("left", klicks=3)

@@ -17,8 +17,6 @@ from p2p_lib.figures.final_tables import KINDS, paper_table, write_table
 from p2p_lib.figures.tables import Cell, Table, emboldened
 from studies import final_figures
 
-MUSTARD = {"name": "ycbineoat/mustard0", "column": "mustard v1"}
-
 
 def errors(percent: float, frames: int) -> dict[str, list[float]]:
     """Of a run with this area under both curves."""

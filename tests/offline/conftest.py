@@ -15,17 +15,23 @@ from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 
+@pytest.fixture(scope="session")
+def another(made, tmp_path_factory):
+    """Makes the made run anew, with the true models as its surfaces, in grey."""
+    return lambda: with_surfaces(made, tmp_path_factory.mktemp("finished") / "run")
+
+
 @pytest.fixture
-def finished(made, tmp_path) -> Path:
-    """The made run with the true models as its surfaces, in grey."""
-    return with_surfaces(made, tmp_path / "run")
+def finished(another) -> Path:
+    """One of these to write to."""
+    return another()
 
 
 @pytest.fixture(scope="module")
-def scene(made, tmp_path_factory):
+def scene(another, tmp_path_factory):
     """What is made of it as a BOP dataset, to be read alone."""
     folder = tmp_path_factory.mktemp("scene")
-    write_product(with_surfaces(made, folder / "run"), "bop-dataset", folder / "set")
+    write_product(another(), "bop-dataset", folder / "set")
     return open_sequence(folder / "set/train/000001")
 
 

@@ -33,7 +33,9 @@ def models(made, tmp_path_factory):
         surface = trimesh.Trimesh(se3.transform(T_OBJ_MODEL, vertices), faces, process=False).subdivide_to_size(0.006)
         surface.visual.vertex_colors = np.full((len(surface.vertices), 3), 128, np.uint8)
         save(surface, run / "meshes" / f"{name}.ply")
-    said = write_product(run, "model", folder / "out", faces=3000)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(texture, "VIEWS", 8)
+        said = write_product(run, "model", folder / "out", faces=3000)
     assert "open: " not in said and "texture of 1 views" not in said
     return folder / "out"
 
@@ -318,7 +320,7 @@ def test_a_texture_that_is_no_better_than_vertex_colours_is_told(finished, tmp_p
     monkeypatch.setattr(model, "beside", lambda *of: 0.08)
     chosen = texture.chosen_rows  # of one row: all take their time
     monkeypatch.setattr(texture, "chosen_rows", lambda made, name, rows, of: chosen(made, name, rows[:1], of))
-    told = write_product(finished, "model", tmp_path / "out", faces=100)
+    told = write_product(finished, "model", tmp_path / "out", faces=3000)
     assert "texture of 1 view," in told
     assert ", no better than the surface's vertex colours (error 16.3 against 15.5 of 255)" in told
     assert ", 8 % of its masks lie beside it: it lacks a part" in told

@@ -65,12 +65,6 @@ def motions_of(then: Frame, now: Frame, moved_m: float) -> Motions:
     return Motions(now, motion, (motion,))
 
 
-def plate_in(patch: Patch, moved_m: float) -> np.ndarray:
-    """(h, w) bool: the plate's component of a patch."""
-    seeds = patch.down(at(PLATE, moved_m).astype(np.float32)) > 0.9
-    return components_touching(connected_components(patch.smooth), seeds)
-
-
 def patch_and_plate(frame: Frame, moved_m: float) -> tuple[Patch, np.ndarray]:
     patch = Patch.of(frame, Box(60, 60, 220, 180), CAMERA, CONFIG)
     return patch, components_touching(

@@ -14,7 +14,6 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.segmenters.builtin import prompted
 from p2p_lib.segmenters.builtin import segmenter as built_in
 from p2p_lib.segmenters.builtin.patch import Box, Patch
@@ -202,9 +201,9 @@ def test_a_click_beside_the_edge_that_has_no_depth_is_not_on_the_wall():
     assert _measured(clicks, frame).tolist() == [[92, 110], [87, 110], [120.4, 110], [215, 200]]
 
 
-def test_one_click_on_an_objects_edge_without_depth_selects_the_object():
+def test_one_click_on_an_objects_edge_without_depth_selects_the_object(opening):
     """By a sensor's noise and shadows; around this pixel the wall alone is measured nearer by."""
-    video = open_sequence("synthetic/three_objects")
+    video = opening("three_objects", 1)
     frame, block = video.frame(0), video.masks(0)["block"]
     assert frame.depth_m[208, 601] == 0 and block[208, 601]
     follow = BuiltinSegmenter(video.camera, preset().segmentation)
@@ -471,8 +470,9 @@ def test_what_selects_nothing_leaves_an_object_its_mask(say):
     follow.segment(picture(0), [Prompt("left", mask=LEFT)])
     instead = ", too." if "box_px" in say else ", or draw a box."  # that is no advice to who drew one
     words = r"'left' in frame 1: no object was found there\. It keeps the mask that it had\. .* of other colours"
-    with pytest.warns(Doubt, match=words + instead):
+    with pytest.warns(Doubt, match=words + instead) as said:
         kept = follow.segment(Frame(1, 1 / 30, frame.rgb, speck), [Prompt("left", 1, **say)]) == 1
+    assert [str(doubt.message) for doubt in said] == [follow.doubts["left"]], "and nothing else is"
     assert iou(kept, LEFT) > 0.9 and iou(follow.segment(picture(2)) == 1, LEFT) > 0.9
 
 
@@ -496,6 +496,7 @@ def test_doubts_are_of_the_newest_prompts(monkeypatch):
         (LEFT, {"points_px": [[122, 112]]}, ""),
         (WALL, {"points_px": [[120, 110]]}, "farther from its mask than that is long. It starts anew there."),
         (LEFT, {"points_px": [[290, 220]]}, "check that depth is in metres."),
+        (LEFT, {"box_px": (250, 180, 310, 230)}, "check that depth is in metres."),
     ],
 )
 def test_a_correction_that_starts_anew_is_doubted(was, say, said):

@@ -85,7 +85,7 @@ def claims(seed, t, k=5, **overrides):
     return np.sum(tells & (without < np.minimum(with_it, 2))), np.sum(tells & (with_it < np.minimum(without, 2)))
 
 
-@pytest.mark.parametrize("seed", SEEDS[:2])
+@pytest.mark.parametrize("seed", SEEDS[:1])
 def test_the_mugs_body_denies_that_it_turns_and_its_handle_tells(seed):
     yaw = np.unwrap(np.arctan2(*made("mug", seed).bodies[0].T_world_model[:, 1::-1, 0].T))
     fastest = [int(t) for t in np.argsort(-np.abs(yaw[5:] - yaw[:-5]))[:100:20]]
@@ -105,7 +105,7 @@ def test_the_handle_shows_in_every_frame_and_the_mug_turns(seed):
     assert R[:, 2, 0].max() < 0.55
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_weak_texture_has_few_points_and_a_shape_that_tells_all(seed):
     scenario, full = made("weak_texture", seed), made("weak_texture", seed, contrast=1.0)
     for t in range(0, scenario.frames, 60):
@@ -127,7 +127,7 @@ def test_weak_texture_has_few_points_and_a_shape_that_tells_all(seed):
     assert np.mean(np.array(held) > 0.003) > 0.95, np.round(held, 4)
 
 
-@pytest.mark.parametrize("seed", SEEDS[:2])
+@pytest.mark.parametrize("seed", SEEDS[:1])
 def test_fading_labels_differ_in_their_print_alone(seed):
     full, faint, blank = (made("fading_label", seed, contrast=c) for c in (1.0, 0.1, 0.0))
     bodies = [s.bodies[0] for s in (full, faint, blank)]

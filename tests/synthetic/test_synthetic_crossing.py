@@ -194,7 +194,7 @@ def test_hidden_and_back_on_the_written_sequence(folder, camera, poses, points, 
     check_promises(o, poses[o], px, visible, 640 * 480 * 0.5)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_every_seed_keeps_the_promises(seed):
     small = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
     scenario = replace(SCENARIOS["crossing"](seed), camera=small)

@@ -19,7 +19,7 @@ from p2p_lib.synthetic.resting import resting
 from tests.synthetic.surface_points import see
 
 SMALL = Camera(615 / 4, 615 / 4, 79.5, 59.5, 160, 120)
-SEEDS = range(3)
+SEEDS = (1, 2)
 _made = {}
 
 
@@ -38,8 +38,7 @@ def steps(scenario, k=0):
     return deg, np.linalg.norm(np.diff(uv, axis=0), axis=1)
 
 
-@pytest.mark.parametrize("name", ["in_hand", "in_hand_10fps"])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("name", "seed"), [*(("in_hand", seed) for seed in SEEDS), ("in_hand_10fps", 1)])
 def test_it_is_as_fast_as_is_said_and_not_all_the_time(name, seed):
     scenario = film(name, seed)
     deg, px = steps(scenario)
@@ -50,7 +49,7 @@ def test_it_is_as_fast_as_is_said_and_not_all_the_time(name, seed):
 
 
 def test_a_seed_is_a_film():
-    first = [SCENARIOS["in_hand"](seed) for seed in (1, 1, 4)]
+    first = [film("in_hand", 1), *(SCENARIOS["in_hand"](seed) for seed in (1, 4))]
     for a, b in zip(first[0].bodies, first[1].bodies, strict=True):
         np.testing.assert_array_equal(a.T_world_model, b.T_world_model)
         np.testing.assert_array_equal(a.mesh.texture, b.mesh.texture)
@@ -78,7 +77,7 @@ def test_it_lies_on_the_table_or_is_held(seed):
         assert min(above) > -0.015
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_the_hand_covers_some_of_it_and_never_all(seed):
     scenario = film("in_hand", seed)
     alone = replace(scenario, bodies=scenario.bodies[:1])
@@ -106,9 +105,7 @@ def distance_m(mesh, points):
 
 @pytest.mark.parametrize("name", ["in_hand", "cluttered_desk", "thin_spatula", "thin_wrench", "thin_scissors"])
 def test_poses_and_depth_agree_on_every_pixel_of_a_mask(name):
-    scenario = SCENARIOS[name](5)
-    fx, cx, cy = scenario.camera.fx / 4, 79.5, 59.5
-    scenario = replace(scenario, camera=Camera(fx, fx, cx, cy, 160, 120))
+    scenario = film(name, 1)
     T_cam_world = se3.inverse(scenario.T_world_cam)
     for t in np.linspace(0, scenario.frames - 1, 5).astype(int):
         exact = scenario.rendered(t)

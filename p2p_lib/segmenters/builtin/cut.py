@@ -34,8 +34,6 @@ _TIE, _CERTAIN = 10.0, 50.0
 _STRANGE = -1.0
 #: Points measured this near to the reconstructed surface are on it; those twice as far in front of it are not.
 _ON_SURFACE_M = 0.008
-#: A component may cover up to this share of the patch's border by accident.
-_AT_THE_BORDER = 0.02
 #: What was beside the object a frame ago by this share of it, is: flow moves a mask's outline by a cell or two.
 _MOST = 0.8
 #: Height in standard deviations of depth at which something stands out of its support.
@@ -104,8 +102,8 @@ def by_geometry(
         log_odds[parts] += config.geometry_weight
     # What is as low as the plane has its penalty already: colour can outweigh one.
     log_odds[measured & ~dilated(component, 1) & (smooth | ~patch.smooth)] -= config.geometry_weight
-    if component[patch.border()].mean() > _AT_THE_BORDER:
-        return log_odds, nothing  # it goes on beyond the patch: it is more than this object
+    if not patch.encloses(component):
+        return log_odds, nothing  # it is more than this object
     log_odds[component] += config.geometry_weight
     return log_odds, component
 

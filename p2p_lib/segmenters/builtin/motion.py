@@ -10,8 +10,9 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth_edges import depth_step_m
+from p2p_lib.core.image import shares
 from p2p_lib.core.types import Frame
-from p2p_lib.segmenters.builtin.patch import Patch, dilated
+from p2p_lib.segmenters.builtin.patch import AT_THE_BORDER, Patch, dilated
 
 #: Two views of one point differ by less than this in colour, as a mean over the channels.
 _SAME_COLOUR = 40.0
@@ -19,8 +20,6 @@ _SAME_COLOUR = 40.0
 _AGREES, _UNDECIDED, _STAYS = 0.75, 0.5, 0.7
 #: A part of fewer cells of the grid proves nothing; one within so many cells of the object may belong to it.
 _FEWEST, _NEAR = 12, 4
-#: A part may cover up to this share of the patch's border by accident.
-_AT_THE_BORDER = 0.02
 #: One frame in so many is remembered, and so many besides the first are kept.
 EVERY, _KEPT = 5, 6
 #: Something was seen through if what is behind is so many steps of depth farther, over so many cells across.
@@ -142,10 +141,7 @@ def _scene_around(patch: Patch, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 def _camera_stayed(p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Frame) -> bool:
     """Whether points of the scene were at the same places of an earlier image, but for where people are."""
     v, u = np.moveaxis(camera.project(p_cam)[:, ::-1] / then.shape * _TILES, -1, 0).astype(int)
-    tile = v * _TILES + u
-    count = np.bincount(tile, minlength=_TILES**2)
-    same = np.bincount(tile, agrees(p_cam, rgb, camera, then, np.eye(4)), _TILES**2)
-    share = (same / np.maximum(count, 1))[count >= _FEWEST]
+    share = shares(v * _TILES + u, agrees(p_cam, rgb, camera, then, np.eye(4)), _FEWEST)
     return len(share) > 0 and float(np.quantile(share, 1 - _TILES_THAT_STAY)) > _TILE_STAYS
 
 
@@ -162,7 +158,7 @@ def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, mot
     adjacent &= size >= _FEWEST
     adjacent[0] = False
     at_border = np.bincount(part[patch.border()], minlength=count) / patch.border().sum()
-    adjacent &= at_border < _AT_THE_BORDER
+    adjacent &= at_border < AT_THE_BORDER
     v, u = np.nonzero(adjacent[part])
     if not len(v) or not scene_stays(patch, motions):
         return np.zeros(patch.shape, bool)

@@ -12,7 +12,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.depth_edges import depth_step_m
-from p2p_lib.core.image import bounds
+from p2p_lib.core.image import ends_px
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import random_walk
 from p2p_lib.segmenters.builtin.colours import colour_codes
@@ -28,6 +28,8 @@ _STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 _TRIPLES = ((0.5 + np.arange(_PLANES) * _STEPS[:, None]) % 1 * _PLANE_POINTS).astype(int)
 #: A support plane holds at least this share of the pixels.
 _SUPPORTS = 0.2
+#: What ends within a patch may cover up to this share of its border by accident.
+AT_THE_BORDER = 0.02
 
 
 @dataclass(frozen=True)
@@ -155,9 +157,7 @@ class Patch:
 
     def ends_px(self, region: np.ndarray) -> np.ndarray:
         """(2, 2) x, y of the first pixel of a region (h, w) bool in the image, and of the first beyond it."""
-        rows, columns = bounds(region)
-        ends = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
-        return ends * self.cell_px + [self.box.left, self.box.top]
+        return ends_px(region) * self.cell_px + [self.box.left, self.box.top]
 
     def nearer(self, one: np.ndarray, other: np.ndarray, like: float) -> np.ndarray:
         """(h, w) bool: the cells that are nearer to ``one`` (h, w) bool than to ``other``, see :meth:`away`."""
@@ -186,6 +186,10 @@ class Patch:
         edge = np.ones(self.shape, bool)
         edge[1:-1, 1:-1] = False
         return edge
+
+    def encloses(self, region: np.ndarray) -> bool:
+        """Whether a region (h, w) bool ends within the patch, rather than going on beyond it."""
+        return bool(region[self.border()].mean() <= AT_THE_BORDER)
 
     def points(self) -> np.ndarray:
         """(h, w, 3) in the camera's frame; 0 where nothing is measured."""

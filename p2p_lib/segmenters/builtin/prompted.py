@@ -13,7 +13,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.image import bounds, nearest_px
+from p2p_lib.core.image import ends_px, nearest_px
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.cut import cut
@@ -185,13 +185,13 @@ class Cutter:
 
     def leaves(self, was: np.ndarray) -> bool:
         """Whether a mask (H, W) bool is farther from every positive click than it is long: it is of something else."""
-        clicks, ends = self.prompt.points_px, _ends(was)
+        clicks, ends = self.prompt.points_px, ends_px(was)
         away = np.maximum(np.maximum(ends[0] - clicks, clicks - ends[1] + 1), 0)
         return bool(len(clicks) and np.linalg.norm(away, axis=1).min() > np.ptp(ends, 0).max())
 
     def correct(self, was: np.ndarray) -> tuple[Box, np.ndarray]:
         """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays."""
-        clicks, ends = self.prompt.points_px, _ends(was)
+        clicks, ends = self.prompt.points_px, ends_px(was)
         px = np.concatenate([ends, clicks, self.prompt.negative_px])
         fits = replace(self.config, side_px=2 * self.config.side_px)
         patch = Patch.of(self.frame, self._room(px.min(0), px.max(0)), self.camera, fits)
@@ -318,9 +318,3 @@ def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:
     slack = _TIGHT * np.ptp(box_px.reshape(2, 2), 0)
     left, top, right, bottom = box_px + np.concatenate([-slack, slack])
     return ((v >= top) & (v <= bottom))[:, None] & ((u >= left) & (u <= right))
-
-
-def _ends(mask: np.ndarray) -> np.ndarray:
-    """(2, 2) the corners, x and y, of the box around a mask (H, W) bool."""
-    rows, columns = bounds(mask)
-    return np.array([[columns.start, rows.start], [columns.stop, rows.stop]])

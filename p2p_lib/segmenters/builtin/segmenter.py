@@ -47,11 +47,11 @@ class Refiner(Protocol):
         self,
         frame: Frame,
         prompts: Mapping[str, Prompt],
-        masks: Mapping[str, np.ndarray],
+        found: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
         corrected: Collection[str] = (),
     ) -> dict[str, np.ndarray]:
-        """Better masks (H, W) bool of some of the objects in this frame; the others keep theirs.
+        """Better masks (H, W) bool of some of the objects ``found`` in this frame; the others keep theirs.
 
         corrected  the objects whose masks the prompts correct
         """
@@ -96,7 +96,7 @@ class BuiltinSegmenter:
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
-        self._begun = {}
+        self.doubts, self._begun = {}, {}
         corrected = [
             name
             for name, cutter in cutters.items()
@@ -115,7 +115,7 @@ class BuiltinSegmenter:
         claims |= self._refined(frame, prompt_of, claims, hints, corrected)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
-        self.doubts = self._doubts(labels, cutters)
+        self.doubts |= self._doubts(labels, cutters)
         self._previous = frame
         return labels
 
@@ -181,12 +181,13 @@ class BuiltinSegmenter:
         _mark(was, had[1])
         if not cutter.prompt.starts:
             return Target(), cutter.correct(was) if was.any() else None
-        mends = was.any() and not cutter.leaves(was)
+        leaves = was.any() and cutter.leaves(was)
+        mends = was.any() and not leaves and cutter.prompt.box_px is None
         if not mends:
-            self._begun[cutter.prompt.name] = bool(was.any())
-        box, x = cutter.correct(was) if mends and cutter.prompt.box_px is None else cutter.start()
+            self._begun[cutter.prompt.name] = bool(leaves)
+        box, x = cutter.correct(was) if mends else cutter.start()
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
-            doubt_nothing(cutter, "It keeps the mask that it had.")
+            self.doubts[cutter.prompt.name] = doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
         return Target(), (box, x)  # its colours and its size are learnt anew
 
@@ -279,6 +280,8 @@ class BuiltinSegmenter:
         masks = {name: labels == label for label, name in enumerate(self._targets, 1)}
         said = {}
         for name, cutter in cutters.items():
+            if name in self.doubts:  # it has selected nothing: the mask is not of it
+                continue
             others = {other: mask for other, mask in masks.items() if other != name}
             said[name] = doubt_prompt(cutter, masks[name], others, self._begun.get(name))
         return {name: text for name, text in said.items() if text}

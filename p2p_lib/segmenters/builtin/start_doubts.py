@@ -10,7 +10,7 @@ import numpy as np
 
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import doubt
-from p2p_lib.core.image import bounds, in_mask
+from p2p_lib.core.image import ends_px, in_mask
 from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, plane_heights, support_plane
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
 
@@ -39,8 +39,7 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
     if elsewhere is None:
         return _not_mended(cutter, mask)
     frame, who = cutter.frame, _who(cutter)
-    rows, columns = bounds(mask)
-    corners = np.array([[columns.start, rows.start], [columns.stop, rows.stop]])
+    corners = ends_px(mask)
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
     inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
     if _flat(patch, inside):

@@ -41,8 +41,6 @@ _CONNECTED, _APART, _UNLIKE = 2.5, -1.5, 1.0
 _NEARBY, _LOOK, _SHADE = 0.2, 4.0, 0.4
 #: Standard deviations up to which a colour is the support's, and from which on another; so many times it is looked.
 _ALIKE, _OTHER, _LOOKS = 3.0, 4.0, 4
-#: A component may cover up to this share of the patch's border by accident.
-_AT_THE_BORDER = 0.02
 #: An unmeasured pixel has this share of its nearest measured one's log-odds.
 _UNMEASURED = 0.8
 
@@ -203,12 +201,12 @@ def by_connection(
     if not height.flat:
         component = components_touching(connected_components(above & patch.smooth), clicked.seeds)
         log_odds[measured & ~dilated(component, 1)] = _APART
-        if component[patch.border()].mean() <= _AT_THE_BORDER:
+        if patch.encloses(component):
             log_odds[component] = _CONNECTED
     if height.plane is not None:
         linked = ((above & measured) | looks) & (patch.smooth | (through_holes & ~measured))
         component = components_touching(connected_components(linked), clicked.seeds)
-        if component[patch.border()].mean() <= _AT_THE_BORDER:
+        if patch.encloses(component):
             log_odds[component] = np.maximum(log_odds[component], _UNLIKE)
     return log_odds
 
