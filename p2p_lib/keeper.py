@@ -24,7 +24,6 @@ from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.evaluation.consistency import consistency
-from p2p_lib.evaluation.suspicions import doubt_growth
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.extended.saving import keep_memory
 
@@ -78,11 +77,7 @@ class Keeper:
         for name, mask in method.masks.items():
             if mask is not None:
                 self.mask_log.add(frame, name, mask)
-        new, corrected = self.first_masks.add(frame, method.masks)
-        for name in corrected:
-            *before_m, length_m = self.mask_log.lengths_m(name)
-            doubt_growth(name, frame.index, length_m, np.array(before_m))
-        return new, corrected
+        return self.first_masks.add(frame, method.masks)
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""

@@ -15,8 +15,10 @@ from p2p_lib.datasets.first_masks import FILE
 from p2p_lib.datasets.images import read_rgb
 from p2p_lib.datasets.prompts import prompts_in
 from p2p_lib.datasets.runs import load_run
+from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import run
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
+from tests.method.test_late_tracker import Late
 
 FAST = {"method.surface": "false", "method.graph": "false"}
 FRAMES, AT = 8, 4  # in which the mask is moved by the flow alone
@@ -94,6 +96,27 @@ def test_a_correction_is_drawn_and_one_that_grows_is_doubted(before, tmp_path):
     (doubt,) = doubted
     assert re.match(rf"correction of '{start.name}' in frame {AT}: its mask is \d+ cm long now, \d\.\d times", doubt)
     assert doubt in run_.info["doubts"]
+
+
+@pytest.mark.parametrize(("late", "too_much"), [(0, False), (0, True), (2, True)])
+def test_the_estimate_says_that_a_correction_takes_in_a_neighbour(late, too_much, opening):
+    """In Python, live and ROS, too, also where a tracker answers late; one that takes in nothing is as sure as ever."""
+    sequence = opening("crossing", AT + 3)
+    method, estimates, said = Point2Pose(sequence.camera, preset().with_values(FAST), tracker=Late(late)), {}, []
+    method.add_object("can", mask=sequence.masks(0)["can"])
+    for index in range(AT + late + 1):
+        if index == AT:
+            masks = sequence.masks(AT)
+            method.correct("can", mask=masks["can"] | masks["box"] if too_much else masks["can"])
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always")
+            estimates |= {e.frame_index: e for e in method.step(sequence.frame(index)).values()}
+        said += [str(doubt.message) for doubt in doubts]
+    found = estimates[AT]
+    assert found.T_cam_obj is not None and (found.confidence <= 0.5) == too_much
+    assert [text for text in said if text in found.reason] == said and len(said) == too_much
+    start = rf"correction of 'can' in frame {AT}: its mask is \d+ cm long now, \d\.\d times"
+    assert not too_much or re.match(start, said[0])
 
 
 def test_a_box_around_too_much_is_doubted_on_the_page_and_by_a_check(before, tmp_path):

@@ -25,6 +25,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, did_you_mean
 from p2p_lib.core.findings import Finding, Level
+from p2p_lib.core.mask_length import doubt_growth, mask_length_m
 from p2p_lib.core.options import lengths_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, evenly
@@ -43,11 +44,9 @@ from p2p_lib.datasets.depth_units import (
 )
 from p2p_lib.datasets.image_sequence import INTRINSICS, paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
-from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.sequence import Sequence, no_truth_said, open_sequence, recognise
 from p2p_lib.evaluation.known_size import Lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
-from p2p_lib.evaluation.suspicions import doubt_growth
 from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.method.sampling import choose, usable_region
 

@@ -28,13 +28,13 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.earlier import selected
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
+from p2p_lib.core.mask_length import doubt_growth, mask_length_m
 from p2p_lib.core.prompts import Prompt, check_depth
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.mask_log import load_masks, mask_length_m
+from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.prompts import as_entry, load_prompts, parse_prompts, prompts_by_frame, run_lengths, save_prompts
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence
-from p2p_lib.evaluation.suspicions import doubt_growth
 
 #: Object to a frame and its mask (H, W) bool there.
 FirstMasks = dict[str, tuple[Frame, np.ndarray]]

@@ -15,15 +15,10 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.files import check_arrays, load_by_object, save_arrays
+from p2p_lib.core.mask_length import CELL_PX, CELLS, length_and_middle, measured_in
 from p2p_lib.core.types import Frame
 
 FILE = "masks.npz"
-#: One pixel of a square of this side is kept.
-CELL_PX = 4
-#: The pixels of an image that are kept.
-CELLS = np.s_[::CELL_PX, ::CELL_PX]
-#: Of what a mask holds, so much is left out at each end when it is measured: depth is wild at an object's edges.
-_ENDS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +93,9 @@ class MaskLog:
         at = np.argwhere(cells)
         low, high = (at.min(0), at.max(0) + 1) if len(at) else (np.zeros(2, int), np.zeros(2, int))
         bits = np.packbits(cells[low[0] : high[0], low[1] : high[1]])
-        p_cam = _points(frame, mask, self._camera)
+        p_cam = measured_in(frame, mask, self._camera)
         box = (*low.tolist(), *(high - low).tolist())
-        self._rows[name].append(_Row(frame.index, int(np.count_nonzero(mask)), box, bits, *_measured(p_cam)))
-
-    def lengths_m(self, name: str) -> np.ndarray:
-        """(n,) the length of what an object's masks hold so far, the newest last; NaN where nothing was measured."""
-        return np.array([row.size_m for row in self._rows[name]])
+        self._rows[name].append(_Row(frame.index, int(np.count_nonzero(mask)), box, bits, *length_and_middle(p_cam)))
 
     def save(self, folder: Path) -> None:
         """Write the file."""
@@ -120,27 +111,3 @@ class MaskLog:
 def load_masks(folder: str | Path) -> dict[str, ObjectMasks]:
     """Object to its masks; empty for a run that was killed before it could write them, and for older ones."""
     return load_by_object(Path(folder) / FILE, ObjectMasks)
-
-
-def mask_length_m(frame: Frame, mask: np.ndarray, camera: Camera) -> float:
-    """The length along its longest axis of what a mask (H, W) bool holds, by depth; NaN where nothing is measured."""
-    return _measured(_points(frame, mask, camera))[0]
-
-
-def _points(frame: Frame, mask: np.ndarray, camera: Camera) -> np.ndarray:
-    """(N, 3) what was measured of a mask at the pixels :data:`CELLS`."""
-    at = np.argwhere(mask[CELLS])
-    depth_m = frame.depth_m[CELLS][mask[CELLS]]
-    return camera.unproject(CELL_PX * at[depth_m > 0, ::-1], depth_m[depth_m > 0])
-
-
-def _measured(p_cam: np.ndarray) -> tuple[float, np.ndarray]:
-    """The length of points (N, 3) along their longest axis without the outermost at both ends, and their median."""
-    if len(p_cam) < 3:
-        return float("nan"), np.full(3, np.nan)
-    centre_m = np.median(p_cam, axis=0)
-    low, high = np.quantile(p_cam[:, 2], [_ENDS, 1 - _ENDS])
-    near = p_cam[(p_cam[:, 2] >= low) & (p_cam[:, 2] <= high)]
-    axis = np.linalg.eigh(np.cov(near.T))[1][:, -1] if len(near) > 3 else np.array([1.0, 0, 0])
-    along_m = np.quantile(p_cam @ axis, [_ENDS, 1 - _ENDS])
-    return float(np.ptp(along_m)) / (1 - 2 * _ENDS), centre_m

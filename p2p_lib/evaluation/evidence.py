@@ -18,10 +18,11 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.image import in_mask
+from p2p_lib.core.mask_length import CELL_PX, CELLS
 from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import evenly
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints
-from p2p_lib.datasets.mask_log import CELL_PX, CELLS, ObjectMasks
+from p2p_lib.datasets.mask_log import ObjectMasks
 from p2p_lib.datasets.models import load_mesh
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.datasets.sequence import Sequence

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.mask_length import mask_length_m
 from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.mask_log import load_masks, mask_length_m
+from p2p_lib.datasets.mask_log import load_masks
 
 #: What is longer than known by more than this factor and this slack, m, is not the object as it is, nor what is always
 #: so much shorter: a part of it may be hidden, or seen end-on. Surfaces of well tracked objects are 1 cm too long.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from p2p_lib.core.errors import doubt
+from p2p_lib.core.mask_length import GROWN
 from p2p_lib.core.types import DOUBTED
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
@@ -25,8 +25,6 @@ OFF_PX, JUMP_PX = 3.0, 12.0
 #: A silhouette that overlaps less with the mask does not fit; a surface is seen through where so much of it is, and is
 #: elsewhere where depth lies on less of it.
 OVERLAP, THROUGH, ON_SURFACE = 0.5, 0.1, 0.6
-#: A mask that holds something so many times as long as usual holds something else besides.
-GROWN = 1.3
 #: Parts of a first mask that are apart, the smaller one this share of it.
 APART = 0.1
 #: Away for good is so much of the end of a run, at least so many frames; away too long, so much of all.
@@ -188,15 +186,6 @@ _RULES = (
         lambda e: e.seen & np.isfinite(e.size_m),
     ),
 )
-
-
-def doubt_growth(name: str, frame_index: int, length_m: float, before_m: np.ndarray) -> None:
-    """Warn of a correction that makes an object's mask much longer than it was in frames before, m; NaN: unknown."""
-    factor = length_m / median_of_known(before_m)
-    if factor > GROWN:
-        got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"
-        fix = "If it holds more than the object: negative clicks on what is not it, a box, or a painted mask."
-        doubt(f"correction of {name!r} in frame {frame_index}", got, fix)
 
 
 def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:

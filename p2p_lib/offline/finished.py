@@ -17,9 +17,10 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import check_new
+from p2p_lib.core.mask_length import CELL_PX
 from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import DOUBTED, Frame
-from p2p_lib.datasets.mask_log import CELL_PX, load_masks
+from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen

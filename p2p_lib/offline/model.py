@@ -20,12 +20,12 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text, replacing
 from p2p_lib.core.image import nearest_px
+from p2p_lib.core.mask_length import CELL_PX
 from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, evenly
 from p2p_lib.datasets.images import save_png
-from p2p_lib.datasets.mask_log import CELL_PX
 from p2p_lib.offline import holes, texture
 from p2p_lib.offline.finished import Finished, Renderer, new_folder
 

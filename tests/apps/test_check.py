@@ -16,13 +16,13 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.findings import Level, as_lines
+from p2p_lib.core.mask_length import mask_length_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder as own
 from p2p_lib.datasets.alignment import Misfit, background_share, misfit
 from p2p_lib.datasets.image_sequence import WRITE_K
 from p2p_lib.datasets.images import SKIP_BAD, read_rgb
-from p2p_lib.datasets.mask_log import mask_length_m
 from p2p_lib.datasets.prompts import load_prompts, prompts_in
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
@@ -399,7 +399,7 @@ def test_what_is_wrong_by_metres_follows_from_a_unit_in_doubt(good, tmp_path, aw
     assert names.index("box: depth") < names.index("registration"), "in the order in which it should be mended"
 
 
-def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch, recwarn):
+def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch):
     """What is an edge of depth is in metres; a size that fits says that all is as far as it looks."""
     monkeypatch.setattr(check, "misfit", lambda *_: Misfit(1.0, 20.0, 0.0, 1.5))
     far = scaled_depth(shutil.copytree(good, tmp_path / "far"), 5)
@@ -415,9 +415,10 @@ def test_registration_is_not_blamed_for_a_unit(good, tmp_path, monkeypatch, recw
     assert found(sized, "box: depth", sizes={"box": 17}).level is Level.WRONG, "one that does not fit tells nothing"
     monkeypatch.setattr("p2p_lib.run.misfit", lambda *_: Misfit(1.0, 20.0, 0.0, 1.5))
     for folder, blamed in ((good, True), (scaled_depth(sized, 4), False)):
-        run(folder, tmp_path / "run", stop=2, if_exists="replace", progress=False)
-        assert any("offset from colour" in str(doubt.message) for doubt in recwarn) == blamed
-        recwarn.clear()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run(folder, tmp_path / "run", stop=2, if_exists="replace", progress=False)
+        assert any("offset from colour" in str(doubt.message) for doubt in caught) == blamed
 
 
 @pytest.mark.parametrize("times", [1, 10])

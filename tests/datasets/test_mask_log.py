@@ -5,8 +5,9 @@ import pytest
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.mask_length import CELLS
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.mask_log import CELLS, FILE, MaskLog, load_masks
+from p2p_lib.datasets.mask_log import FILE, MaskLog, load_masks
 
 CAMERA = Camera(500, 500, 159.5, 119.5, 322, 241)
 SHAPE = (241, 322)

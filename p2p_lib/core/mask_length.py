@@ -1,0 +1,56 @@
+"""How long what a mask holds is, by depth, and whether a correction has made it much longer than it was."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import doubt
+from p2p_lib.core.types import Frame
+
+#: One pixel of a square of this side is looked at.
+CELL_PX = 4
+#: These pixels of an image.
+CELLS = np.s_[::CELL_PX, ::CELL_PX]
+#: Of what a mask holds, so much is left out at each end when it is measured: depth is wild at an object's edges.
+_ENDS = 0.05
+#: A mask that holds something so many times as long as usual holds something else besides.
+GROWN = 1.3
+
+
+def mask_length_m(frame: Frame, mask: np.ndarray, camera: Camera) -> float:
+    """The length along its longest axis of what a mask (H, W) bool holds, by depth; NaN where nothing is measured."""
+    return length_and_middle(measured_in(frame, mask, camera))[0]
+
+
+def measured_in(frame: Frame, mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3) what was measured of a mask at the pixels :data:`CELLS`."""
+    at = np.argwhere(mask[CELLS])
+    depth_m = frame.depth_m[CELLS][mask[CELLS]]
+    return camera.unproject(CELL_PX * at[depth_m > 0, ::-1], depth_m[depth_m > 0])
+
+
+def length_and_middle(p_cam: np.ndarray) -> tuple[float, np.ndarray]:
+    """The length of points (N, 3) along their longest axis without the outermost at both ends, and their median."""
+    if len(p_cam) < 3:
+        return float("nan"), np.full(3, np.nan)
+    centre_m = np.median(p_cam, axis=0)
+    low, high = np.quantile(p_cam[:, 2], [_ENDS, 1 - _ENDS])
+    near = p_cam[(p_cam[:, 2] >= low) & (p_cam[:, 2] <= high)]
+    axis = np.linalg.eigh(np.cov(near.T))[1][:, -1] if len(near) > 3 else np.array([1.0, 0, 0])
+    along_m = np.quantile(p_cam @ axis, [_ENDS, 1 - _ENDS])
+    return float(np.ptp(along_m)) / (1 - 2 * _ENDS), centre_m
+
+
+def doubt_growth(name: str, frame_index: int, length_m: float, before_m: np.ndarray) -> str:
+    """Warn of a correction that makes an object's mask much longer than it was in frames before, m; NaN: unknown.
+
+    Returns the warning; empty where there is none.
+    """
+    known_m = before_m[np.isfinite(before_m)]
+    factor = length_m / np.median(known_m) if len(known_m) else float("nan")
+    if not factor > GROWN:
+        return ""
+    got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"
+    fix = "If it holds more than the object: negative clicks on what is not it, a box, or a painted mask."
+    return doubt(f"correction of {name!r} in frame {frame_index}", got, fix)
