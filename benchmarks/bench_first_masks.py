@@ -89,7 +89,7 @@ class Start:
         for prompt in self.prompts:
             others = [other.points_px for other in self.prompts if other is not prompt]
             beside = np.concatenate([np.zeros((0, 2)), *others])
-            question = Question.of_prompt(prompt, nothing, beside, corrects=False)
+            question = Question.of_prompt(prompt, nothing, beside, mends=False)
             mask = question.answer(network.candidates(features, question.prompt), features)
             if mask is not None:
                 found[prompt.name] = mask

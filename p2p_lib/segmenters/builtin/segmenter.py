@@ -26,7 +26,7 @@ from p2p_lib.segmenters.builtin.bystanders import with_bystanders
 from p2p_lib.segmenters.builtin.finding import find, near_last
 from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
-from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, Effect
 from p2p_lib.segmenters.builtin.start_doubts import doubt_nothing, doubt_prompt
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
@@ -49,11 +49,11 @@ class Refiner(Protocol):
         prompts: Mapping[str, Prompt],
         found: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
-        corrected: Collection[str] = (),
+        mended: Collection[str] = (),
     ) -> dict[str, np.ndarray]:
         """Better masks (H, W) bool of some of the objects ``found`` in this frame; the others keep theirs.
 
-        corrected  the objects whose masks the prompts correct
+        mended  the objects whose masks the prompts mend
         """
 
 
@@ -71,8 +71,7 @@ class BuiltinSegmenter:
         self._previous: Frame | None = None
         self._frames = 0
         self.doubts: dict[str, str] = {}
-        # Whose masks prompts of the newest frame did not mend, but began; and whether it had another one elsewhere.
-        self._begun: dict[str, bool] = {}
+        self._effects: dict[str, Effect] = {}  # of the newest frame's prompts on their objects' masks
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,12 +95,7 @@ class BuiltinSegmenter:
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
-        self.doubts, self._begun = {}, {}
-        corrected = [
-            name
-            for name, cutter in cutters.items()
-            if cutter.prompt.box_px is None and self._targets.get(name, Target()).in_view
-        ]
+        self.doubts, self._effects = {}, {}
         masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
@@ -112,7 +106,7 @@ class BuiltinSegmenter:
                 asked = cutters.get(name), hints, taken, name in due
                 self._targets[name], claims[name] = self._locate(view, name, *asked)
                 _mark(taken, claims[name])
-        claims |= self._refined(frame, prompt_of, claims, hints, corrected)
+        claims |= self._refined(frame, prompt_of, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
         self.doubts |= self._doubts(labels, cutters)
@@ -179,13 +173,10 @@ class BuiltinSegmenter:
             had = self._follow(view, cutter.prompt.name, target, hints, taken, due)
         was = np.zeros(view.frame.shape, bool)
         _mark(was, had[1])
+        self._effects[cutter.prompt.name] = effect = cutter.effect(was)
         if not cutter.prompt.starts:
             return Target(), cutter.correct(was) if was.any() else None
-        leaves = was.any() and cutter.leaves(was)
-        mends = was.any() and not leaves and cutter.prompt.box_px is None
-        if not mends:
-            self._begun[cutter.prompt.name] = bool(leaves)
-        box, x = cutter.correct(was) if mends else cutter.start()
+        box, x = cutter.correct(was) if effect is Effect.MENDED else cutter.start()
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             self.doubts[cutter.prompt.name] = doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
@@ -233,7 +224,6 @@ class BuiltinSegmenter:
         prompt_of: Mapping[str, Prompt],
         claims: Mapping[str, Claim],
         hints: Mapping[str, Hint],
-        corrected: Collection[str],
     ) -> dict[str, Claim]:
         """The refiner's claims, of the objects whose masks it replaces."""
         if self._refiner is None:
@@ -242,7 +232,8 @@ class BuiltinSegmenter:
         for name, claim in claims.items():
             _mark(masks[name], claim)
         prompts = {name: prompt for name, prompt in prompt_of.items() if prompt.mask is None}
-        refined, whole = self._refiner.refine(frame, prompts, masks, hints, corrected), Box(0, 0, *frame.shape[::-1])
+        mended = [name for name, effect in self._effects.items() if effect is Effect.MENDED]
+        refined, whole = self._refiner.refine(frame, prompts, masks, hints, mended), Box(0, 0, *frame.shape[::-1])
         return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
     @staticmethod
@@ -283,7 +274,7 @@ class BuiltinSegmenter:
             if name in self.doubts:  # it has selected nothing: the mask is not of it
                 continue
             others = {other: mask for other, mask in masks.items() if other != name}
-            said[name] = doubt_prompt(cutter, masks[name], others, self._begun.get(name))
+            said[name] = doubt_prompt(cutter, masks[name], others, self._effects[name])
         return {name: text for name, text in said.items() if text}
 
 
