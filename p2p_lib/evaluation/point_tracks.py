@@ -64,7 +64,7 @@ def tapvid(
     }
 
 
-class Outcome(IntEnum):
+class QueryOutcome(IntEnum):
     """What came of asking for a point in a frame."""
 
     NOT_ASKED = 0
@@ -77,11 +77,11 @@ class Outcome(IntEnum):
 def outcomes(
     uv_true: np.ndarray, visible_true: np.ndarray, uv_px: np.ndarray, visible: np.ndarray, scored: np.ndarray
 ) -> np.ndarray:
-    """(T, N) uint8 of :class:`Outcome`; pixels are those of the image as it is."""
+    """(T, N) uint8 of :class:`QueryOutcome`; pixels are those of the image as it is."""
     near = visible_true & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
-    outcome = np.where(near, Outcome.RIGHT, Outcome.WRONG)
-    silent = np.where(visible_true, Outcome.MISSED, Outcome.HIDDEN)
-    return np.where(scored, np.where(visible, outcome, silent), Outcome.NOT_ASKED).astype(np.uint8)
+    outcome = np.where(near, QueryOutcome.RIGHT, QueryOutcome.WRONG)
+    silent = np.where(visible_true, QueryOutcome.MISSED, QueryOutcome.HIDDEN)
+    return np.where(scored, np.where(visible, outcome, silent), QueryOutcome.NOT_ASKED).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.remembered import Remembered, follow
-from p2p_lib.extended.scene import Scene
+from p2p_lib.extended.scene import CameraTracker
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
 from p2p_lib.method.object_model import Requests
@@ -43,7 +43,7 @@ class Reacquisition(Frontend):
         stopwatch: Stopwatch,
         executor: Executor,
         on: Container[str],
-        scene: Scene | None,
+        scene: CameraTracker | None,
     ):
         # To the paper's steps an object's two maps are its ObjectTracker, but for hint(), which is not asked for here.
         super().__init__(camera, tracker, segmenter, cast(Any, objects), stopwatch, executor)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.evaluation.point_tracks import Outcome
+from p2p_lib.evaluation.point_tracks import QueryOutcome
 from p2p_lib.evaluation.tracker_score import TrackTask
 from p2p_lib.figures import overlay, style
 from studies import tracking2d as tracks
@@ -25,8 +25,8 @@ def scores(task):
 
 def test_a_perfect_tracker_is_right_or_rightly_silent(scores):
     came = tracks.score_outcomes(scores["perfect"])
-    assert set(np.unique(came)) == {Outcome.NOT_ASKED, Outcome.HIDDEN, Outcome.RIGHT}
-    assert ((came == Outcome.RIGHT) <= scores["perfect"].truth.visible).all()
+    assert set(np.unique(came)) == {QueryOutcome.NOT_ASKED, QueryOutcome.HIDDEN, QueryOutcome.RIGHT}
+    assert ((came == QueryOutcome.RIGHT) <= scores["perfect"].truth.visible).all()
 
 
 def test_a_tracker_that_did_not_run_has_dashes_and_a_reason(scores):

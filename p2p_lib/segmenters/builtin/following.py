@@ -23,7 +23,7 @@ _REAPPEARS_WITHIN_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class FlowPrediction:
     """An object's mask of a frame ago, moved by the optical flow: on a patch of this frame, its probability (h, w).
 
     jumped    (h, w) bool: its depth changed, so that something else has come before it or it has gone
@@ -47,7 +47,7 @@ class Prediction:
         return self.patch.box, self.patch.up(self.prior)
 
 
-def predict(view: View, target: Target) -> Prediction:
+def predict(view: View, target: Target) -> FlowPrediction:
     """Move the mask of an object that was seen a frame ago by the optical flow."""
     frame, cfg, seen = view.frame, view.config, target.seen
     assert seen is not None and target.size_m is not None and view.previous is not None  # a frame ago
@@ -68,10 +68,10 @@ def predict(view: View, target: Target) -> Prediction:
     changed = abs(area - np.count_nonzero(was > 0.5)) > _MAX_AREA_CHANGE * area
     doubtful = changed or np.count_nonzero(jumped) > _MAX_JUMPED * area or blind > _MAX_UNMEASURED * area
     left = np.count_nonzero(jumped & (patch.depth_m > z_before)) > area / 2
-    return Prediction(patch, prior, jumped, shown, beside, bool(left), bool(doubtful))
+    return FlowPrediction(patch, prior, jumped, shown, beside, bool(left), bool(doubtful))
 
 
-def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: Prediction) -> Claim:
+def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: FlowPrediction) -> Claim:
     """Cut the object out around its predicted mask.
 
     None if it has left: what shows there lies behind it, or has the surroundings' colours without its points.

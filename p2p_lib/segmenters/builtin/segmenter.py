@@ -24,7 +24,7 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.bystanders import with_bystanders
 from p2p_lib.segmenters.builtin.finding import find, near_last
-from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
+from p2p_lib.segmenters.builtin.following import FlowPrediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
 from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, Effect
 from p2p_lib.segmenters.builtin.start_doubts import doubt_nothing, doubt_prompt
@@ -189,7 +189,7 @@ class BuiltinSegmenter:
         target: Target,
         hints: Mapping[str, Hint],
         taken: np.ndarray,
-        predicted: Prediction | None,
+        predicted: FlowPrediction | None,
     ) -> tuple[Target, Claim]:
         """Follow an object that was seen a frame ago, else find it outside what is ``taken`` (H, W) bool."""
         hint = hints.get(name, _NO_HINT)
