@@ -136,7 +136,7 @@ class Reacquisition(Frontend):
             seen[name] = self.maps[name].observe(inputs.frame, mask, self.tracks, self._sightings.get(name), *by_whom)
         if "rejection" in self.on:
             self.apply(self._misplaced(seen, inputs.masks))
-        return seen | self._redetect(inputs.frame, seen) if "redetection" in self.on else seen
+        return seen | self._redetect(seen) if "redetection" in self.on else seen
 
     def _misplaced(self, seen: Mapping[str, OurObservation], given: Masks) -> dict[str, Requests]:
         """Tracks of absent objects that are on something else.
@@ -148,7 +148,7 @@ class Reacquisition(Frontend):
         within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
         return {name: self.maps[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
-    def _redetect(self, frame: Frame, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
+    def _redetect(self, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
         """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
         looked = {name: self.maps[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}

@@ -23,7 +23,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
-from p2p_lib.core.image import in_mask
+from p2p_lib.core.image import in_mask, mask_iou
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
@@ -123,7 +123,7 @@ class Question:
         fits = (own >= _OWN) & (others <= _OTHERS) & (offered.score >= _LEAST_SCORE)
         worth = worth + own - others
         if self.expected is not None:
-            overlap = np.array([_iou(mask, self.expected) for mask in masks])
+            overlap = np.array([mask_iou(mask, self.expected) for mask in masks])
             fits, worth = fits & (overlap >= _LEAST_OVERLAP), worth + _OVERLAP * overlap
         if self.looks is not None:
             alike = np.array([self._alike(mask, features) for mask in masks])
@@ -335,10 +335,6 @@ def _spread(uv_px: np.ndarray, count: int) -> np.ndarray:
 def _shares(uv_px: np.ndarray, masks: Iterable[np.ndarray], none: float) -> np.ndarray:
     """(C,) the share of the pixels (N, 2) in each mask; ``none`` where there are no pixels."""
     return np.array([in_mask(uv_px, mask).mean() if len(uv_px) else none for mask in masks])
-
-
-def _iou(one: np.ndarray, other: np.ndarray) -> float:
-    return np.count_nonzero(one & other) / max(1, int(np.count_nonzero(one | other)))
 
 
 def _without_flaws(mask: np.ndarray) -> np.ndarray:

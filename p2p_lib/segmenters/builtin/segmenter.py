@@ -11,9 +11,9 @@ This module is the order of the stages in a frame; the package's docstring says 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,30 +31,14 @@ from p2p_lib.segmenters.builtin.start_doubts import doubt_nothing, doubt_prompt
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
 
+if TYPE_CHECKING:
+    from p2p_lib.segmenters.sam2 import Sam2Refiner
+
 #: An object with a confident pose is cut out in every third frame, in turns, and moved by the optical flow in between.
 _TURNS = 3
 _NO_HINT = Hint()
 #: Objects are beside each other whose boxes are so near, px.
 _BESIDE_PX = 12
-
-
-class Refiner(Protocol):
-    """Replaces masks of :class:`BuiltinSegmenter`, see :class:`p2p_lib.segmenters.sam2.Sam2Refiner`."""
-
-    name: str
-
-    def refine(
-        self,
-        frame: Frame,
-        prompts: Mapping[str, Prompt],
-        found: Mapping[str, np.ndarray],
-        hints: Mapping[str, Hint],
-        mended: Collection[str] = (),
-    ) -> dict[str, np.ndarray]:
-        """Better masks (H, W) bool of some of the objects ``found`` in this frame; the others keep theirs.
-
-        mended  the objects whose masks the prompts mend
-        """
 
 
 class BuiltinSegmenter:
@@ -64,7 +48,7 @@ class BuiltinSegmenter:
     doubts   of objects that a prompt of the newest frame has started or corrected: what is doubtful about their masks
     """
 
-    def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
+    def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Sam2Refiner | None = None):
         self.name = "builtin" if refiner is None else refiner.name
         self.camera, self.config, self._refiner = camera, config, refiner
         self._targets: dict[str, Target] = {}
