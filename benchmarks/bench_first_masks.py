@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import in_a_line
+from common import in_a_line, write_page
 from pandas import DataFrame
 
 from p2p_lib.core.backends import make_segmenter
@@ -26,7 +26,6 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.tables import as_markdown
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import load_prompts
 from p2p_lib.datasets.sequence import open_sequence
@@ -89,7 +88,7 @@ class Start:
         for prompt in self.prompts:
             others = [other.points_px for other in self.prompts if other is not prompt]
             beside = np.concatenate([np.zeros((0, 2)), *others])
-            question = Question.of_prompt(prompt, nothing, beside, corrects=False)
+            question = Question.of_prompt(prompt, nothing, beside, mends=False)
             mask = question.answer(network.candidates(features, question.prompt), features)
             if mask is not None:
                 found[prompt.name] = mask
@@ -166,10 +165,8 @@ def main() -> None:
     numbers = DataFrame(rows)[[GIVEN, MEAN, LOWEST]]
     for what, values in (("mean", numbers.mean()), ("lowest", numbers.min())):
         rows.append({"sequence": what, "object": "", **values})
-    table = as_markdown(DataFrame(rows).round(1))
-    page = PAGE.format(machine=in_a_line(**{PACKAGE: version(PACKAGE)}), seeds=asked.seeds, clicks=CLICKS, rows=table)
-    (Path(__file__).parent / "first_masks.md").write_text(page)
-    print(page)
+    machine, table = in_a_line(**{PACKAGE: version(PACKAGE)}), DataFrame(rows).round(1)
+    write_page("first_masks", PAGE, machine=machine, seeds=asked.seeds, clicks=CLICKS, rows=table)
 
 
 if __name__ == "__main__":

@@ -8,20 +8,16 @@ masks of another segmenter in ``reference_masks/mug``) and the clicks, ``prompts
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
-from common import in_a_line
+from common import options, tracked, write_page
 from pandas import DataFrame
 
-from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.masks import read_labels
-from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.consistency import HEADS, consistency
 from p2p_lib.evaluation.mask_score import agreement
-from p2p_lib.run import run
 
 PAGE = """# A mug that a hand turns
 
@@ -45,26 +41,19 @@ def overlap(folder: Path, reference: Path, shape: tuple[int, int]) -> float:
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--seeds", type=int, default=5)
-    asked = parser.parse_args()
+    asked = options(seeds=5).parse_args()
     video = next(asked.data.glob("**/mug_in_hand"))
     prompts = next(asked.data.glob("**/prompts/mug_in_hand.json"))
     camera = open_sequence(video).camera
     rows, frames = [], 0
     for seed in range(asked.seeds):
         out = asked.out / f"mug_{seed}"
-        run(video, out, prompts=prompts, seed=seed, save_masks=True, if_exists="resume", progress=False)
-        done = load_run(out)
+        done = tracked(video, out, prompts=prompts, seed=seed, save_masks=True)
         said, frames = consistency(done), len(done.objects["mug"])
         numbers = {head: said.objects["mug"][key] for key, (head, _) in HEADS.items()}
         iou = overlap(out, video / "reference_masks" / "mug", (camera.height, camera.width))
         rows.append({"seed": seed, **numbers, "masks with SAM 2's [%]": iou, "verdict": said.verdict("mug")})
-    page = PAGE.format(machine=in_a_line(), frames=frames, rows=as_markdown(DataFrame(rows).round(1)))
-    (Path(__file__).parent / "hand.md").write_text(page)
-    print(page)
+    write_page("hand", PAGE, frames=frames, rows=DataFrame(rows).round(1))
 
 
 if __name__ == "__main__":

@@ -10,23 +10,20 @@ there are left out. ``--all`` takes all five re-created YCB scenes, of 541 frame
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
 
 import numpy as np
-from common import in_a_line
+from common import options, tracked, write_page
 from pandas import DataFrame, Series, concat
 
 from p2p_lib.benchmark.scoring import chamfer
-from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import reopen
 from p2p_lib.evaluation.protocol import evaluate, rate
 from p2p_lib.offline.products import write_product
 from p2p_lib.offline.refine import refine_run
-from p2p_lib.run import run
 from p2p_lib.synthetic.generate import scenario_dir
 from p2p_lib.synthetic.paper_subset import SEQUENCES
 
@@ -72,14 +69,12 @@ def colours(folder: Path) -> dict[str, float]:
 
 def pair(sequence: str | Path, folder: Path, seed: int, models: dict[str, Path], stop: int | None) -> DataFrame:
     """A row for each object: causal, offline, and the time of the latter in units of the former's."""
-    options = {"masks": "clicks", "models": models, "save_masks": True, "stop": stop}
-    run(sequence, folder, seed=seed, if_exists="resume", progress=False, **options)
+    causal = tracked(sequence, folder, seed=seed, masks="clicks", models=models, save_masks=True, stop=stop)
     took = folder / "refine_s.json"
     if not took.is_file():
         began = time.perf_counter()
         refine_run(folder)
         took.write_text(json.dumps(time.perf_counter() - began))
-    causal = load_run(folder)
     frames = len(next(iter(causal.objects.values())))
     hz, _ = rate(causal.timings)
     sides = {"causal": scores(folder, models), "offline": scores(folder / "offline", models)}
@@ -110,10 +105,7 @@ def paired(name: str, objects: DataFrame) -> dict[str, object]:
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--seeds", type=int, default=3)
+    parser = options(seeds=3)
     parser.add_argument("--all", action="store_true")
     parser.add_argument("--only", type=lambda names: names.split(","))
     parser.add_argument("--stop", type=int)
@@ -135,14 +127,10 @@ def main() -> None:
         video = scenario_dir(name, models=str(ycb)) if name in SEQUENCES else video  # rendered when it is needed
         runs = [pair(video, asked.out / f"{name}_{seed}", seed, models, asked.stop) for seed in range(asked.seeds)]
         measured[name] = concat(runs)
-    page = PAGE.format(
-        machine=in_a_line(),
-        seeds=", ".join(map(str, range(asked.seeds))),
-        rows=as_markdown(DataFrame([row(name, objects) for name, objects in measured.items()])),
-        pairs=as_markdown(DataFrame([paired(*one) for one in [*measured.items(), ("all", concat(measured.values()))]])),
-    )
-    part = asked.only or asked.stop
-    ((asked.out if part else Path(__file__).parent) / "offline.md").write_text(page)
+    seeds, where = ", ".join(map(str, range(asked.seeds))), {"folder": asked.out} if asked.only or asked.stop else {}
+    rows = [row(name, objects) for name, objects in measured.items()]
+    pairs = [paired(*one) for one in [*measured.items(), ("all", concat(measured.values()))]]
+    write_page("offline", PAGE, seeds=seeds, rows=rows, pairs=pairs, **where)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Writes ``benchmarks/other_objects.md``; runs go below OUT, where what was cut sh
 
 from __future__ import annotations
 
-import argparse
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,14 +17,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from bench_variants import Varied, columns, tracked
-from common import in_a_line
-from pandas import DataFrame
+from bench_variants import Varied, columns, scored
+from common import options, seeds_said, write_page
 
 from p2p_lib.core import se3
 from p2p_lib.core.image import in_image
 from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.sequence import ObjectTruth, open_sequence
 
 SCENES = Path(__file__).parent / "other_objects.toml"
@@ -122,11 +119,7 @@ class Others(Varied):
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--seeds", type=int, default=2)
-    asked = parser.parse_args()
+    asked = options(seeds=2).parse_args()
     rows = []
     for scene in tomllib.loads(SCENES.read_text())["scene"]:
         name, first = scene["video"], scene["frame"]
@@ -145,14 +138,11 @@ def main() -> None:
             models = others.models(asked.out / "models" / others.name)
             runs = [asked.out / f"{others.name}_{seed}" for seed in range(asked.seeds)]
             how = [{"prompts": others.prompts(seed), "models": models} for seed in range(asked.seeds)]
-            scores = tracked(others, how, runs)
+            scores = scored(others, how, runs)
             for one in others.objects:
                 of_one = columns([[of_seed[one]] for of_seed in scores])
                 rows.append({"video": f"{name} from {first}", "": way, "object": one.replace("_", " "), **of_one})
-    seeds = f"0 to {asked.seeds - 1}" if asked.seeds > 1 else "0"
-    page = PAGE.format(machine=in_a_line(), seeds=seeds, rows=as_markdown(DataFrame(rows)))
-    (Path(__file__).parent / "other_objects.md").write_text(page)
-    print(page)
+    write_page("other_objects", PAGE, seeds=seeds_said(asked.seeds), rows=rows)
 
 
 if __name__ == "__main__":

@@ -9,22 +9,18 @@ data is not there are left out.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import in_a_line
-from pandas import DataFrame
+from common import options, tracked, write_page
 
-from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.models import find_models, load_points
-from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.protocol import model_frames, scored_frames
-from p2p_lib.run import run
 from p2p_lib.synthetic import SCENARIOS
 from p2p_lib.synthetic.generate import write_scenario
 from p2p_lib.synthetic.noise import NOISE
@@ -59,12 +55,6 @@ Memories of objects that are not in the video: frames with a pose, of all.
 def memories(folder: Path, names: Sequence[str]) -> list[Path]:
     """Those that a run kept of some objects."""
     return [path for name in names if (path := folder / "maps" / f"{name}.npz").is_file()]
-
-
-def tracked(sequence: str | Path, out: Path, **options: object) -> Run:
-    """The run in a folder, made unless it is there and finished."""
-    run(sequence, out, if_exists="resume", progress=False, **options)
-    return load_run(out)
 
 
 def found(case: str, learnt: Run, again: Run, models: Mapping[str, Path]) -> list[dict[str, object]]:
@@ -133,9 +123,7 @@ def synthetic(out: Path, cases: int) -> list[dict]:
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--data", type=Path, default=Path("data"))
+    parser = options()
     parser.add_argument("--cases", type=int, default=20)
     asked = parser.parse_args()
     out, data = asked.out, asked.data
@@ -173,10 +161,7 @@ def main() -> None:
             nothing += absent("desk_fast", desk, out / "desk_absent", bottle + own)
         nothing += absent("synthetic/occlusion", "synthetic/occlusion", out / "occlusion_absent", bottle + own)
     rows += synthetic(out, asked.cases)
-    kept = {"machine": in_a_line(), "sight": _SIGHT_PX, "frames": _FRAMES}
-    page = PAGE.format(found=as_markdown(DataFrame(rows)), absent=as_markdown(DataFrame(nothing)), **kept)
-    (Path(__file__).parent / "recall.md").write_text(page)
-    print(page)
+    write_page("recall", PAGE, found=rows, absent=nothing, sight=_SIGHT_PX, frames=_FRAMES)
 
 
 if __name__ == "__main__":

@@ -9,23 +9,18 @@ chance, or by what was chosen while looking at it, breaks here. DIR holds the se
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from common import in_a_line
-from pandas import DataFrame
+from common import options, seeds_said, tracked, write_page
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.tables import as_markdown
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import load_prompts
-from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import ObjectTruth, Sequence, open_sequence
 from p2p_lib.evaluation.protocol import ObjectScore, evaluate
-from p2p_lib.run import run
 
 VIDEOS = ("desk_fast", "redkitchen_table")
 #: Objects of fewer pixels in the first frame are not clicked on.
@@ -151,10 +146,7 @@ def starts(of: Varied, clicks: Path) -> dict[str, object] | None:
 
 def main() -> None:
     """See the module."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--data", type=Path, default=Path("data"))
-    parser.add_argument("--seeds", type=int, default=2)
+    parser = options(seeds=2)
     parser.add_argument("--only", nargs="+", choices=VIDEOS, default=VIDEOS)
     asked = parser.parse_args()
     rows = []
@@ -164,20 +156,16 @@ def main() -> None:
             how = starts(of, next(asked.data.glob(f"**/prompts/{name}.json"), Path()))
             if how is not None:
                 runs = [asked.out / f"{name}_{of.name.replace(' ', '_')}_{seed}" for seed in range(asked.seeds)]
-                scores = [list(of_seed.values()) for of_seed in tracked(of, [how] * asked.seeds, runs)]
+                scores = [list(of_seed.values()) for of_seed in scored(of, [how] * asked.seeds, runs)]
                 rows.append({"video": name, "": of.name, **columns(scores)})
-    seeds = f"0 to {asked.seeds - 1}" if asked.seeds > 1 else "0"
-    page = PAGE.format(machine=in_a_line(), seeds=seeds, rows=as_markdown(DataFrame(rows)))
-    (Path(__file__).parent / "variants.md").write_text(page)
-    print(page)
+    write_page("variants", PAGE, seeds=seeds_said(asked.seeds), rows=rows)
 
 
-def tracked(of: Varied, starts: list[dict], runs: list[Path]) -> list[dict[str, ObjectScore]]:
+def scored(of: Varied, starts: list[dict], runs: list[Path]) -> list[dict[str, ObjectScore]]:
     """An object's score by its name, of each seed: how it starts, and the folder that it is tracked into."""
     scores = []
     for seed, (how, out) in enumerate(zip(starts, runs, strict=True)):
-        run(of, out, seed=seed, if_exists="resume", progress=False, **how)
-        scores.append(evaluate(load_run(out)).objects)
+        scores.append(evaluate(tracked(of, out, seed=seed, **how)).objects)
     return scores
 
 

@@ -1,4 +1,4 @@
-"""What the benchmarks share: timing in turn, tables with ratios, sections of the page that ``scale.py`` writes.
+"""What the benchmarks share: timing in turn, tables with ratios, runs by seed, and the pages that they write.
 
 Whatever is compared runs in turn in one process, so that what else the machine does slows all of it alike: ratios can
 be compared between machines and days, milliseconds cannot.
@@ -6,6 +6,7 @@ be compared between machines and days, milliseconds cannot.
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import time
@@ -13,12 +14,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from pandas import DataFrame
 
+from p2p_lib.core.tables import as_markdown
 from p2p_lib.datasets.provenance import provenance
+from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.run import run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -152,3 +157,35 @@ def machine() -> dict[str, str]:
 def in_a_line(**more: str) -> str:
     """The same, with what is named besides; without the load, on which accuracy does not depend."""
     return ", ".join(f"{what} {value}" for what, value in (machine() | more).items() if not what.startswith("load"))
+
+
+def options(seeds: int | None = None) -> argparse.ArgumentParser:
+    """The options of what tracks: a folder for its runs, ``--data`` with videos, and how many ``--seeds``, if any."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--data", type=Path, default=Path("data"))
+    if seeds is not None:
+        parser.add_argument("--seeds", type=int, default=seeds)
+    return parser
+
+
+def tracked(sequence: str | Path | Sequence, out: Path, **how: Any) -> Run:
+    """The run in a folder, made unless it is there and finished."""
+    run(sequence, out, if_exists="resume", progress=False, **how)
+    return load_run(out)
+
+
+def seeds_said(count: int) -> str:
+    """Seeds as a page names them."""
+    return f"0 to {count - 1}" if count > 1 else "0"
+
+
+def write_page(name: str, page: str, folder: Path = Path(__file__).parent, **parts: object) -> None:
+    """``name``.md of a page, whose {parts} are words or the rows of tables; ``machine`` is known. Prints it, too."""
+    shown = {
+        what: as_markdown(DataFrame(part)) if isinstance(part, list | DataFrame) else part
+        for what, part in parts.items()
+    }
+    text = page.format(**{"machine": in_a_line(), **shown})
+    (folder / f"{name}.md").write_text(text, encoding="utf-8")
+    print(text)

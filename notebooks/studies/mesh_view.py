@@ -11,7 +11,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.figures import overlay
-from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.overlay import OrientedBox
 from p2p_lib.synthetic.render import Light, render
 from p2p_lib.synthetic.shapes import Mesh
 
@@ -65,7 +65,7 @@ def portrait(
     filling  (V, 3) what fills the image, by default the surface itself
     """
     filling = np.asarray(mesh.vertices if filling is None else filling)
-    centre = Box.around(filling).T_obj_box[:3, 3]
+    centre = OrientedBox.around(filling).T_obj_box[:3, 3]
     radius_m = float(np.linalg.norm(filling - centre, axis=1).max())
     focal_px = 1.4 * min(height_px, width_px)
     camera = Camera(focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2, width_px, height_px)

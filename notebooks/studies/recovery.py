@@ -26,7 +26,7 @@ from p2p_lib.evaluation.confidence import MAX_DEG, MAX_M, Judged, reliability, r
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.evaluation.recovery import MAX_ADDS_M, RecoveryEvent, recovered_within
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.overlay import OrientedBox
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels
 from p2p_lib.figures.scenes import Scene
 from p2p_lib.synthetic.generate import write_scenario
@@ -218,7 +218,7 @@ def recovery_counts(cases: Mapping[tuple[str, str], tuple[Run, Evaluation]]) -> 
 def around(scene: Scene, name: str, indices: Sequence[int]) -> list[tuple[int, int, int, int]]:
     """The rectangles (left, top, right, bottom), all of one size, of where an object truly is in each frame."""
     obj, camera = scene.run.objects[name], scene.sequence.camera
-    box = Box.around(scene.run.points[name])
+    box = OrientedBox.around(scene.run.points[name])
     uv = camera.project(box.corners(obj.T_cam_model[[scene.row(i) for i in indices]]))
     low, high = uv.min(1), uv.max(1)
     size = np.minimum(1.6 * (high - low).max(0), [camera.width, camera.height]).astype(int)

@@ -22,7 +22,7 @@ from pandas import DataFrame, Series, concat
 from scipy import stats
 
 from p2p_lib.core.errors import BadInput, MissingData
-from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.interfaces import PointTracker, Wrapper
 from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.datasets.sequence import open_sequence
@@ -53,39 +53,36 @@ _HEADS = {
 }
 
 
-class RecordedTracker:
+class RecordedTracker(Wrapper):
     """A 2D tracker that passes everything on to another one and keeps what it was asked and what it answered."""
 
     def __init__(self, tracker: PointTracker):
-        self._tracker = tracker
+        self.original = tracker
         self._frames: list[int] = []
         self._queries: list[tuple[int, np.ndarray, np.ndarray]] = []
         self._answers: list[tuple[int, Tracks]] = []
 
-    def __getattr__(self, name: str):
-        return getattr(self._tracker, name)
-
     def start(self, frame: Frame, *args, **kwargs) -> None:
         """Begin a stream, and a new record."""
         self._frames, self._queries, self._answers = [frame.index], [], []
-        self._tracker.start(frame, *args, **kwargs)
+        self.original.start(frame, *args, **kwargs)
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """New queries in the newest frame that was answered."""
-        ids = self._tracker.add(uv_px)
+        ids = self.original.add(uv_px)
         self._queries.append((self._newest(), ids, np.asarray(uv_px, float).reshape(-1, 2)))
         return ids
 
     def track(self, frame: Frame, *args, **kwargs) -> Tracks:
         """The tracker's answer, written down with the frame that it is of."""
         self._frames.append(frame.index)
-        tracks = self._tracker.track(frame, *args, **kwargs)
+        tracks = self.original.track(frame, *args, **kwargs)
         self._answers.append((self._newest(), tracks))
         return tracks
 
     def _newest(self) -> int:
         """Index of the frame that the newest answer is of."""
-        return self._frames[max(len(self._frames) - 1 - self._tracker.latency_frames, 0)]
+        return self._frames[max(len(self._frames) - 1 - self.original.latency_frames, 0)]
 
     def keypoints(self, scene: TrueScene) -> dict[str, DataFrame]:
         """Per object whose mask a keypoint began in: ``frame``, ``u_px``, ``v_px`` and ``error_px`` of its track.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -15,17 +17,28 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import MissingBackend
 from p2p_lib.core.types import Status
 from p2p_lib.datasets.sequence import Sequence
-from p2p_lib.evaluation.point_tracks import FOUND_PX, Outcome, Reliability, after_query, outcomes, reliability
+from p2p_lib.evaluation.point_tracks import FOUND_PX, after_query
 from p2p_lib.evaluation.tracker_score import TrackerScore, TrackTask
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.plots import WIDTH_IN, logarithmic, panels, status_intervals
 
+
+class QueryOutcome(IntEnum):
+    """What came of asking for a point in a frame."""
+
+    NOT_ASKED = 0
+    HIDDEN = 1  # it is, and the tracker says so
+    RIGHT = 2  # visible and found within 8 px
+    MISSED = 3  # visible, but called hidden
+    WRONG = 4  # called visible where it is not
+
+
 #: Colour and words of what came of asking for a point: right is the quiet one, wrong the colour of lost.
 _OUTCOMES = {
-    Outcome.RIGHT: ("#CFCFCF", f"found within {FOUND_PX:.0f} px"),
-    Outcome.MISSED: ("#222222", "visible, but called hidden"),
-    Outcome.WRONG: (style.STATUS[Status.LOST][0], "called visible where it is not"),
-    Outcome.HIDDEN: ("#FFFFFF", "hidden, and known to be"),
+    QueryOutcome.RIGHT: ("#CFCFCF", f"found within {FOUND_PX:.0f} px"),
+    QueryOutcome.MISSED: ("#222222", "visible, but called hidden"),
+    QueryOutcome.WRONG: (style.STATUS[Status.LOST][0], "called visible where it is not"),
+    QueryOutcome.HIDDEN: ("#FFFFFF", "hidden, and known to be"),
 }
 _MIN_ABSENCE = 15  # frames
 
@@ -65,8 +78,46 @@ def tracker_table(scores: Mapping[str, TrackerScore | str]) -> DataFrame:
     return DataFrame(rows).round(3)
 
 
+def outcomes(
+    uv_true: np.ndarray, visible_true: np.ndarray, uv_px: np.ndarray, visible: np.ndarray, scored: np.ndarray
+) -> np.ndarray:
+    """(T, N) uint8 of :class:`QueryOutcome`; pixels are those of the image as it is."""
+    near = visible_true & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
+    outcome = np.where(near, QueryOutcome.RIGHT, QueryOutcome.WRONG)
+    silent = np.where(visible_true, QueryOutcome.MISSED, QueryOutcome.HIDDEN)
+    return np.where(scored, np.where(visible, outcome, silent), QueryOutcome.NOT_ASKED).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """How far off predictions are, by how uncertain they said they were: bins of equally many predictions.
+
+    uncertainty  (B,) median of the bin
+    median_px, p90_px  (B,) error that half, and nine in ten, of the bin stay below
+    rank_correlation  Spearman's, of uncertainty and error over all predictions
+    """
+
+    uncertainty: np.ndarray
+    median_px: np.ndarray
+    p90_px: np.ndarray
+    rank_correlation: float
+
+
+def reliability(error_px: np.ndarray, uncertainty: np.ndarray) -> Reliability:
+    """Errors (M,) of predictions against their uncertainty (M,); equal uncertainties stay in one order."""
+    from scipy.stats import spearmanr
+
+    parts = [part for part in np.array_split(np.argsort(uncertainty, kind="stable"), 10) if len(part)]
+    return Reliability(
+        np.array([np.median(uncertainty[part]) for part in parts]),
+        np.array([np.median(error_px[part]) for part in parts]),
+        np.array([np.quantile(error_px[part], 0.9) for part in parts]),
+        float(spearmanr(uncertainty, error_px).statistic) if len(error_px) > 1 else float("nan"),
+    )
+
+
 def score_outcomes(score: TrackerScore) -> np.ndarray:
-    """(T, N) uint8 of :class:`Outcome`: what came of every query in every frame."""
+    """(T, N) uint8 of :class:`QueryOutcome`: what came of every query in every frame."""
     truth, run = score.truth, score.run
     scored = after_query(score.queries.frame, len(truth.uv_px)) & truth.known
     return outcomes(truth.uv_px, truth.visible, run.uv_px, run.visible, scored)
@@ -99,14 +150,16 @@ class TrackScene:
         image, seen_by = overlay.zoomed(frame.rgb, camera, self.region_px, width_px)
         uv_px, true_px = (overlay.zoomed_px(uv, camera, seen_by) for uv in (score.run.uv_px, score.truth.uv_px))
         past, came = slice(max(index - trail, 0), index + 1), self.outcomes[index]
-        path_px = np.where((self.outcomes[past] == Outcome.RIGHT)[..., None], uv_px[past], np.nan)
+        path_px = np.where((self.outcomes[past] == QueryOutcome.RIGHT)[..., None], uv_px[past], np.nan)
         for name, points in self._points.items():
-            right, missed, wrong = (points & (came == k) for k in (Outcome.RIGHT, Outcome.MISSED, Outcome.WRONG))
+            right, missed, wrong = (
+                points & (came == k) for k in (QueryOutcome.RIGHT, QueryOutcome.MISSED, QueryOutcome.WRONG)
+            )
             image = overlay.draw_trail(image, path_px[:, right].swapaxes(0, 1), self._colours[name], 1)
-            image = overlay.draw_points(image, true_px[index, missed], _OUTCOMES[Outcome.MISSED][0], 0.7)
+            image = overlay.draw_points(image, true_px[index, missed], _OUTCOMES[QueryOutcome.MISSED][0], 0.7)
             image = overlay.draw_points(image, uv_px[index, right], self._colours[name], 2.5)
-            image = overlay.draw_points(image, uv_px[index, wrong], _OUTCOMES[Outcome.WRONG][0], 4, filled=False)
-        kinds = (Outcome.RIGHT, Outcome.WRONG, Outcome.MISSED)
+            image = overlay.draw_points(image, uv_px[index, wrong], _OUTCOMES[QueryOutcome.WRONG][0], 4, filled=False)
+        kinds = (QueryOutcome.RIGHT, QueryOutcome.WRONG, QueryOutcome.MISSED)
         counts = ", ".join(f"{(came == k).sum()} {k.name.lower()}" for k in kinds)
         return overlay.draw_caption(image, f"{frame.time_s:.2f} s: {counts}")
 
@@ -138,8 +191,8 @@ def found_over_time(scores: Mapping[str, TrackerScore | str], times_s: np.ndarra
     figure, (axis, below) = panels(2, (WIDTH_IN, 3.8), [3, 1])
     for colour, (label, score) in zip(style.METHODS, ran.items(), strict=False):
         came = score_outcomes(score)
-        in_sight = ((came != Outcome.NOT_ASKED) & score.truth.visible).sum(1)
-        share = np.where(in_sight > 0, (came == Outcome.RIGHT).sum(1) / np.maximum(in_sight, 1), np.nan)
+        in_sight = ((came != QueryOutcome.NOT_ASKED) & score.truth.visible).sum(1)
+        share = np.where(in_sight > 0, (came == QueryOutcome.RIGHT).sum(1) / np.maximum(in_sight, 1), np.nan)
         axis.plot(times_s, 100 * share, color=colour, label=label)
     below.fill_between(times_s, in_sight, color=style.NEUTRAL[1], lw=0)
     axis.set(ylabel=f"within {FOUND_PX:.0f} px [%]", ylim=(0, 103))

@@ -67,21 +67,40 @@ class LiveCount:
         return f"{self.frames} frames in {self.seconds:.1f} s{rate}, {self.dropped} dropped"
 
 
+@dataclass(frozen=True, eq=False)
+class LiveOptions:
+    """What goes with a camera that is tracked.
+
+    first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
+    out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
+    overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
+    backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
+    say      told what it waits for before the first image, then where ``words`` come from, and whether ``sizes`` fit
+    words    says of objects what comes in meanwhile; there need be no prompts then
+    page     shows every frame that was tracked
+    """
+
+    first: Frame | None = None
+    out: str | Path | None = None
+    overlay: str | Path | None = None
+    if_exists: IfExists = "refuse"
+    backlog: int = DEFAULT_BACKLOG
+    say: Callable[[str], object] = lambda line: None
+    words: Words | None = None
+    page: LiveClicker | None = None
+
+    def __post_init__(self) -> None:
+        if self.backlog < 0:
+            raise BadInput("backlog", self.backlog, "how many images may wait, from 0")
+
+
 def track_live(
     camera: LiveCamera,
     prompts: Iterable[Prompt],
     on_estimate: Callable[[PoseEstimate], None],
     options: RunOptions | None = None,
-    *,
-    first: Frame | None = None,
+    live: LiveOptions | None = None,
     count: LiveCount | None = None,
-    out: str | Path | None = None,
-    overlay: str | Path | None = None,
-    if_exists: IfExists = "refuse",
-    backlog: int = DEFAULT_BACKLOG,
-    say: Callable[[str], object] = lambda line: None,
-    words: Words | None = None,
-    page: LiveClicker | None = None,
 ) -> LiveCount:
     """Follow the objects of the prompts until the camera ends; every estimate goes to ``on_estimate`` at once.
 
@@ -89,86 +108,133 @@ def track_live(
              which is not dropped
     options  the method and its parameters; ``masks`` names the segmenter, ``stop`` the image before which it ends,
              ``memory`` what is known of objects, which are looked for without prompts, ``sizes`` how long they are
-    first    an image that was taken before, and is the one that the prompts' frame 0 means (see ``p2p live``)
     count    filled as frames pass, for whoever wants to know meanwhile or after an interruption
-    out      a folder that keeps the run, as :func:`p2p_lib.run.run` writes it; ``if_exists`` as there, without resuming
-    overlay  a film of it, .mp4, .gif or .webp, as the tracker sees it
-    backlog  how many images may wait while one takes long, before the oldest is dropped; with 0 the newest one wins
-    say      told what it waits for before the first image, then where ``words`` come from, and whether ``sizes`` fit
-    words    says of objects what comes in meanwhile; there need be no prompts then
-    page     shows every frame that was tracked
 
     Closes the camera at the end, whatever ends it. Raises :class:`BadInput` for clicks that do not fit.
     """
-    options, count = options or RunOptions(), count or LiveCount()
-    prompts = sorted(prompts, key=lambda p: p.frame)
-    if not (prompts or words or options.memory):
+    options, live, count = options or RunOptions(), live or LiveOptions(), count or LiveCount()
+    waiting = sorted(prompts, key=lambda p: p.frame)
+    if not (waiting or live.words or options.memory):
         raise BadInput("prompts", "none", "what to follow: clicks, boxes or masks of objects, memories, or words")
-    config, segmenter = options.config(), segmenter_of(options)
     if options.stop is not None and options.stop < 1:
         raise BadInput("stop", options.stop, "the number of an image from 1", "Leave it out to end with Ctrl-C.")
-    if backlog < 0:
-        raise BadInput("backlog", backlog, "how many images may wait, from 0")
-    config = config.with_values({"segmentation.sam2_every": 0})  # no image waits for it
     memories = load_memories(options.memory or ())
-    named_so_far = {*memories, *(prompt.name for prompt in prompts)}
-    sizes_m = lengths_m(options.sizes, options.sizes or () if words else sorted(named_so_far))
-    method = Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter)
-    warm_up(say)
+    named_so_far = {*memories, *(prompt.name for prompt in waiting)}
+    sizes_m = lengths_m(options.sizes, options.sizes or () if live.words else sorted(named_so_far))
+    method = _warm_method(camera, options, live.say)
     recall(method, memories, options.frozen)
-    named = options.tracker if isinstance(options.tracker, str) else ""
-    if named.startswith("builtin") and segmenter in (DEFAULT_SEGMENTER, "sam2"):
-        _warm_up(Point2Pose(camera.camera, config, options.tracker, options.detector, segmenter))
-    every_prompt = list(prompts)
+    tracked = _Tracked(camera, method, options, live, count, waiting, list(waiting), list(memories), sizes_m)
     with ExitStack() as kept:
-        listeners: list[Listener] = []
-        if page is not None:
-            listeners.append(lambda frame, estimates: page.see(frame, method.masks))
-        if overlay is not None:
-            listeners.append(_filmed(kept.enter_context(Film(overlay)), camera.name, method, first))
-        if out is not None:
-            run = _kept(out, camera, method, options, every_prompt, memories, if_exists, sizes_m)
-            listeners.append(kept.enter_context(run))
-        if sizes_m:
-            watch = Watch(sizes_m, say)
-            listeners.append(lambda frame, estimates: watch.add(frame, method.masks, method.camera))
-            kept.callback(watch.end)
-
-        def tell(estimates: dict[str, PoseEstimate]) -> None:
+        listeners = tracked.listeners(kept)
+        stop = math.inf if options.stop is None else options.stop
+        newest = kept.enter_context(Newest(camera, {p.frame for p in waiting}, live.backlog, stop))
+        for estimates in tracked.estimates(newest):
             if (of := method.frame) is not None:
                 for estimate in estimates.values():
                     on_estimate(estimate)
                 for listen in listeners:
                     listen(of, estimates)
+    if waiting:
+        if live.first is None and not count.frames:
+            raise MissingData(f"camera {camera.name}", "it gave no image", "Is it connected, and not in use elsewhere?")
+        got = f"frame {waiting[0].frame}, which never came"
+        raise BadInput(f"prompt of {waiting[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")
+    return count
 
-        start_s = monotonic()
-        stop = math.inf if options.stop is None else options.stop
-        newest = kept.enter_context(Newest(camera, {p.frame for p in prompts}, backlog, stop))
+
+Listener = Callable[[Frame, dict[str, PoseEstimate]], object]
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracked:
+    """A camera, its tracker and what goes with them; ``waiting`` are the ``prompts`` whose image is to come."""
+
+    camera: LiveCamera
+    method: Point2Pose
+    options: RunOptions
+    live: LiveOptions
+    count: LiveCount
+    waiting: list[Prompt]
+    prompts: list[Prompt]
+    memories: list[str]
+    sizes_m: Mapping[str, float]
+
+    def estimates(self, newest: Newest) -> Iterator[dict[str, PoseEstimate]]:
+        """Those of image after image, of which each takes its prompts, and what words say meanwhile."""
+        method, count, first, words, start_s = self.method, self.count, self.live.first, self.live.words, monotonic()
         frame = first or newest.take()
-        nothing_came = frame is None
         if frame is not None and words is not None and words.reads:
-            say(f"{camera.name} runs; objects are told on standard input, a line each: {FORM}")
+            self.live.say(f"{self.camera.name} runs; objects are told on standard input, a line each: {FORM}")
         while frame is not None:
-            while prompts and prompts[0].frame <= (0 if frame is first else frame.index):
-                method.tell(prompts.pop(0))
-            every_prompt += words.tell(method, frame) if words else []
-            tell(method.step(frame))
+            while self.waiting and self.waiting[0].frame <= (0 if frame is first else frame.index):
+                method.tell(self.waiting.pop(0))
+            self.prompts.extend(words.tell(method, frame) if words else [])
+            yield method.step(frame)
             if frame is not first:  # which may be long ago
                 count.count(frame)
                 if count.frames == 2 and count.dropped:  # the first frame took as long as first masks do
-                    say(f"{count.dropped} images came while the first masks were made, and were dropped")
+                    self.live.say(f"{count.dropped} images came while the first masks were made, and were dropped")
             count.seconds = monotonic() - start_s
             frame = newest.take()
-        if newest.stopped and options.stop is not None:
-            count.until(options.stop)
-        for estimates in method.finish():
-            tell(estimates)
-    if prompts:
-        if nothing_came:
-            raise MissingData(f"camera {camera.name}", "it gave no image", "Is it connected, and not in use elsewhere?")
-        got = f"frame {prompts[0].frame}, which never came"
-        raise BadInput(f"prompt of {prompts[0].name!r}", got, "a frame of the camera", "Click in an earlier one.")
-    return count
+        if newest.stopped and self.options.stop is not None:
+            count.until(self.options.stop)
+        yield from method.finish()
+
+    def listeners(self, kept: ExitStack) -> list[Listener]:
+        """What every frame is shown to; ``kept`` ends them."""
+        listeners, live, method = list[Listener](), self.live, self.method
+        if (page := live.page) is not None:
+            listeners.append(lambda frame, estimates: page.see(frame, method.masks))
+        if live.overlay is not None:
+            listeners.append(_filmed(kept.enter_context(Film(live.overlay)), self.camera.name, method, live.first))
+        if live.out is not None:
+            listeners.append(kept.enter_context(self._kept(live.out)))
+        if self.sizes_m:
+            watch = Watch(self.sizes_m, live.say)
+            listeners.append(lambda frame, estimates: watch.add(frame, method.masks, method.camera))
+            kept.callback(watch.end)
+        return listeners
+
+    @contextmanager
+    def _kept(self, out: str | Path) -> Iterator[Listener]:
+        """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
+        camera, method, prompts = self.camera, self.method, self.prompts
+        sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
+        objects = tuple(dict.fromkeys([*(prompt.name for prompt in prompts), *self.memories]))
+        # The models of all its objects: any may be added yet.
+        how: dict[str, Any] = {"models": find_models(sequence), "if_exists": self.live.if_exists}
+        writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, **how)
+        writer.info |= described(method, self.options, prompts)
+        keeper, stopped = Keeper(writer, method, self.options.save_masks, prompts, self.sizes_m), None
+
+        def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
+            writer.info["stop"] = frame.index + 1
+            keeper.add(frame, estimates)
+
+        with writer, noted(keeper.doubts):
+            try:
+                yield listen
+            except KeyboardInterrupt as stop:
+                stopped = stop
+                writer.keep_whole_frames()
+            if writer.begun and writer.info["objects"]:
+                writer.info["prompts"] = [prompt.as_dict() for prompt in prompts]  # those that came meanwhile, too
+                keeper.save_maps()
+                keeper.judge()
+        if stopped:
+            raise stopped
+
+
+def _warm_method(camera: LiveCamera, options: RunOptions, say: Callable[[str], object]) -> Point2Pose:
+    """A tracker of which the first image of a camera need not wait for anything that could be loaded before."""
+    config = options.config().with_values({"segmentation.sam2_every": 0})  # no image waits for it
+    parts = camera.camera, config, options.tracker, options.detector, segmenter_of(options)
+    method = Point2Pose(*parts)
+    warm_up(say)
+    named = options.tracker if isinstance(options.tracker, str) else ""
+    if named.startswith("builtin") and parts[-1] in (DEFAULT_SEGMENTER, "sam2"):
+        _warm_up(Point2Pose(*parts))
+    return method
 
 
 def segmenter_of(options: RunOptions) -> Any:
@@ -199,9 +265,6 @@ def _warm_up(method: Point2Pose) -> None:
         log.disabled = was
 
 
-Listener = Callable[[Frame, dict[str, PoseEstimate]], object]
-
-
 def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> Listener:
     """Draws every frame into a film, but for one that was taken before."""
     times_s: list[float] = []
@@ -213,44 +276,6 @@ def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> L
             film.add(image, frame.time_s - times_s[0])
 
     return listen
-
-
-@contextmanager
-def _kept(
-    out: str | Path,
-    camera: LiveCamera,
-    method: Point2Pose,
-    options: RunOptions,
-    prompts: list[Prompt],
-    memories: Iterable[str],
-    if_exists: IfExists,
-    sizes_m: Mapping[str, float],
-) -> Iterator[Listener]:
-    """Keeps every frame in a run's folder; Ctrl-C is how one stops a camera, so that it ends the run well."""
-    sequence = getattr(camera, "sequence", None) or Stream(camera.name, camera.camera)
-    objects = tuple(dict.fromkeys([*(prompt.name for prompt in prompts), *memories]))
-    # The models of all its objects: any may be added yet.
-    how: dict[str, Any] = {"models": find_models(sequence), "if_exists": if_exists}
-    writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, **how)
-    writer.info |= described(method, options, prompts)
-    keeper, stopped = Keeper(writer, method, options.save_masks, prompts, sizes_m), None
-
-    def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
-        writer.info["stop"] = frame.index + 1
-        keeper.add(frame, estimates)
-
-    with writer, noted(keeper.doubts):
-        try:
-            yield listen
-        except KeyboardInterrupt as stop:
-            stopped = stop
-            writer.keep_whole_frames()
-        if writer.begun and writer.info["objects"]:
-            writer.info["prompts"] = [prompt.as_dict() for prompt in prompts]  # those that came meanwhile, too
-            keeper.save_maps()
-            keeper.judge()
-    if stopped:
-        raise stopped
 
 
 def click_first(

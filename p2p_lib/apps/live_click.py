@@ -36,13 +36,13 @@ class LiveClicker(Clicker):
     words  says it to the tracker, for its next frame
     """
 
-    def __init__(self, camera: LiveCamera, words: Words, port: int = 0):
+    def __init__(self, camera: LiveCamera, words: Words):
         self._words = words
         self._newest: tuple[Frame | None, dict[str, np.ndarray]] = (None, {})
         self._shown: Frame | None = None
         self._masks: dict[str, np.ndarray] = {}
         self._names: tuple[str, ...] = ()
-        super().__init__(_Shown(camera.name, camera.camera), "", port=port)
+        super().__init__(_Shown(camera.name, camera.camera), "")
 
     def see(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> None:
         """What is shown next: a frame with the masks (H, W) bool of all objects, None where unknown."""

@@ -207,7 +207,7 @@ def _without_map(run: Path) -> list[str]:
 )
 def _live(a: argparse.Namespace) -> None:
     from p2p_lib.apps.click import invite
-    from p2p_lib.apps.live import LiveCount, click_first, json_line, segmenter_of, text_line, track_live
+    from p2p_lib.apps.live import LiveCount, LiveOptions, click_first, json_line, segmenter_of, text_line, track_live
     from p2p_lib.apps.live_click import LiveClicker
     from p2p_lib.apps.live_words import Words, outlet
     from p2p_lib.core.voxels import check_device
@@ -216,33 +216,34 @@ def _live(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.run_writer import look_into
     from p2p_lib.offline.finished import check_confidence
 
-    options, count, first = _asked(a), LiveCount(), None
+    options, count = _asked(a), LiveCount()
     check_device(options.config().device)  # what does not fit is said before the camera starts
     segmenter_of(options)
     check_confidence(a.min_confidence or 0.0)
     lengths_m(options.sizes, options.sizes or ())
     _film_wanted(a.overlay)
-    keep = {"count": count, "out": a.out, "overlay": a.overlay, "if_exists": a.if_exists or "refuse"}
-    keep["say"] = warn
-    keep |= {} if a.backlog is None else {"backlog": a.backlog}
+    live = LiveOptions(out=a.out, overlay=a.overlay, if_exists=a.if_exists or "refuse", say=warn)
+    live = live if a.backlog is None else replace(live, backlog=a.backlog)
     if a.out is not None:
-        look_into(a.out, keep["if_exists"], resumable=False)  # before anyone clicks
+        look_into(a.out, live.if_exists, resumable=False)  # before anyone clicks
     prompts = load_prompts(a.prompts) if a.prompts else ()
     camera = open_camera(a.camera, a.rate)
     try:
         if not (prompts or options.memory or a.listen or a.click):
             prompts, first = click_first(camera, warn, not a.no_browser)
+            live = replace(live, first=first)
         line = text_line if a.out is not None and sys.stdout.isatty() else json_line
         if a.min_confidence is not None:
             line = partial(line, least=a.min_confidence)
         with ExitStack() as opened:
             send = opened.enter_context(outlet(a.to, warn)) if a.to else partial(print, flush=True)
             if a.listen or a.click:
-                keep["words"] = words = Words(sys.stdin if a.listen else None, lambda error: warn(f"p2p live: {error}"))
-            if a.click:
-                keep["page"] = page = opened.enter_context(LiveClicker(camera, words))
-                invite(page, warn, not a.no_browser)
-            track_live(camera, prompts, lambda estimate: send(line(estimate)), options, first=first, **keep)
+                words = Words(sys.stdin if a.listen else None, lambda error: warn(f"p2p live: {error}"))
+                page = opened.enter_context(LiveClicker(camera, words)) if a.click else None
+                live = replace(live, words=words, page=page)
+            if live.page is not None:
+                invite(live.page, warn, not a.no_browser)
+            track_live(camera, prompts, lambda estimate: send(line(estimate)), options, live, count)
     except KeyboardInterrupt:
         pass  # how one stops a camera
     finally:

@@ -87,7 +87,7 @@ def _poses(job: Job, out: Path) -> Outcome:
         done = load_run(unfinished)
         judge: Callable[..., Any] | None = fault_done if job.sequence.fault else chamfer if job.chamfer else None
         judge = judge and partial(judge, done, sequence, job.models)
-        outcome = scored(done, job.models, judge, job.key, job.min_mask_px)
+        outcome = scored(done, job.models, judge, job.key, job.min_visible_px)
         times = _times(done, cpu_s) | {"width_px": sequence.camera.width}
         outcome = outcome.model_copy(update={"times": times, "ran": outcome.ran | {"library": library_version()}})
         shutil.rmtree(run_path(out, job.key), ignore_errors=True)

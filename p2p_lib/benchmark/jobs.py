@@ -46,7 +46,7 @@ class Job:
 
     measure  "poses": the whole method; "tracks": its 2D tracker alone
     chamfer  whether the reconstruction is scored
-    min_mask_px  of an object's mask in frames that are scored
+    min_visible_px  of an object's mask in frames that are scored
     key      16 digits, "" where it cannot run; then ``reason`` says why
     """
 
@@ -55,7 +55,7 @@ class Job:
     seed: int
     measure: Literal["poses", "tracks"]
     chamfer: bool
-    min_mask_px: int = MIN_VISIBLE_PX
+    min_visible_px: int = MIN_VISIBLE_PX
     key: str = ""
     reason: str = ""
 
@@ -105,7 +105,7 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
                 for measure in measures:
                     for seed in scope.seeds:
                         reason = missing or lacking[method.name]
-                        job = Job(method, sequence, seed, measure, plan.chamfer, plan.min_mask_px, reason=reason)
+                        job = Job(method, sequence, seed, measure, plan.chamfer, plan.min_visible_px, reason=reason)
                         jobs.append(job if reason else _keyed(job, configs[method.name], known))
     return jobs
 
@@ -160,7 +160,7 @@ def _keyed(job: Job, config: Config, known: dict[tuple, str]) -> Job:
             "fault": planned.fault and [planned.fault.model_dump(), planned.during],
             "prompts": [[p.as_dict(), "" if p.mask is None else _sha(p.mask.tobytes())] for p in job.prompts],
             "chamfer": job.chamfer,
-            "min_mask_px": job.min_mask_px,
+            "min_visible_px": job.min_visible_px,
         }
     except P2PError as error:
         if isinstance(error, BadInput) and planned.name.startswith(SYNTHETIC):

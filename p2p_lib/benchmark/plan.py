@@ -169,7 +169,7 @@ class Plan(Strict):
     gpu_jobs so many runs at a time of methods that need a GPU
     chamfer  whether reconstructions are scored as well
     tracks   whether the 2D trackers are scored by themselves as well
-    min_mask_px  frames in which less of an object's mask is to be seen are not scored: often the first of a return
+    min_visible_px  frames in which less of an object's mask is to be seen are not scored: often the first of a return
     quick    a few frames of bundled data, None where it has none
     """
 
@@ -181,7 +181,7 @@ class Plan(Strict):
     gpu_jobs: Annotated[int, Field(ge=1)] = 1
     chamfer: bool = False
     tracks: bool = False
-    min_mask_px: Count = MIN_VISIBLE_PX
+    min_visible_px: Count = MIN_VISIBLE_PX
     method: Annotated[list[Method], Field(min_length=1)]
     quick: Scope | None = None
     full: Scope

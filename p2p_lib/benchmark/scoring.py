@@ -35,13 +35,15 @@ Models = Mapping[str, str | Path]
 Judge = Callable[[str, ObjectScore], dict[str, Any]]
 
 
-def scored(done: Run, models: Models, judge: Judge | None, key: str = "", min_mask_px: int = MIN_VISIBLE_PX) -> Outcome:
+def scored(
+    done: Run, models: Models, judge: Judge | None, key: str = "", min_visible_px: int = MIN_VISIBLE_PX
+) -> Outcome:
     """A run's errors by both alignments, its returns, and what ``judge`` says of each object besides.
 
     models  object to model file, over those that the run was made with
     judge   :func:`chamfer` or :func:`fault_done` of the run
     """
-    first, over_all = (evaluate(done, models, align, min_mask_px) for align in ("first", "all"))
+    first, over_all = (evaluate(done, models, align, min_visible_px) for align in ("first", "all"))
     objects = {}
     for name, score in first.objects.items():
         objects[name] = ObjectOutcome(
@@ -73,10 +75,10 @@ def run_rows(
     name, seed = done.info["sequence"], done.info["seed"]
     try:
         judge = partial(chamfer, done, reopen(done.info), models)
-        outcome = scored(done, models, judge, min_mask_px=min_visible_px)
+        outcome = scored(done, models, judge, min_visible_px=min_visible_px)
     except MissingData as error:
         gone = {"no_chamfer": str(error)}
-        outcome = scored(done, models, lambda name, score: gone, min_mask_px=min_visible_px)
+        outcome = scored(done, models, lambda name, score: gone, min_visible_px=min_visible_px)
     called = Method(name=method or (done.path.stem if done.info["tracker"] == IMPORTED else str(done.info["tracker"])))
     scope = Scope(seeds=[seed or 0], sequence=[sequence or PlannedSequence(name=name)])
     plan = Plan(name="run", title="one run", method=[called], full=scope)

@@ -10,7 +10,7 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.image import in_image, in_mask
-from p2p_lib.core.interfaces import Candidates, Detector, Hint, Segmenter
+from p2p_lib.core.interfaces import Candidates, Detector, Hint, Segmenter, Wrapper
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 
@@ -18,24 +18,19 @@ from p2p_lib.core.types import Frame
 _INSIDE = 0.5
 
 
-class CheckedDetector:
+class CheckedDetector(Wrapper):
     """A detector whose answers are checked: :class:`BadInput` names it, the frame, and what cannot be used.
 
     Implements :class:`~p2p_lib.core.interfaces.Detector`; whatever else the detector has is reached through it.
     """
 
     def __init__(self, detector: Detector):
-        self.name, self._detector = detector.name, detector
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_detector":  # while it is copied or unpickled there is none yet
-            raise AttributeError(name)
-        return getattr(self._detector, name)
+        self.name, self.original = detector.name, detector
 
     def detect(self, frame: Frame, mask: np.ndarray) -> Candidates:
         """Candidates in ``mask`` (H, W) bool, best first."""
-        found = self._detector.detect(frame, mask)
-        check_candidates(self._detector, frame, mask, found)
+        found = self.original.detect(frame, mask)
+        check_candidates(self.original, frame, mask, found)
         return found
 
 

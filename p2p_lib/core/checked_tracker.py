@@ -10,7 +10,7 @@ import numpy as np
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.checked_answers import bad_answer, kind_of
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.interfaces import PointTracker, Wrapper
 from p2p_lib.core.types import Frame, Tracks
 
 #: The kinds of a column of tracks: NumPy's letters, and what they are called.
@@ -22,7 +22,7 @@ _COLUMNS = {
 }
 
 
-class CheckedTracker:
+class CheckedTracker(Wrapper):
     """A tracker whose answers are checked: :class:`BadInput` names it, the frame, and what cannot be used.
 
     Implements :class:`~p2p_lib.core.interfaces.PointTracker`; whatever else the tracker has is reached through it.
@@ -30,24 +30,19 @@ class CheckedTracker:
 
     def __init__(self, tracker: PointTracker):
         self.name, self.latency_frames = tracker.name, tracker.latency_frames
-        self._tracker, self._frame = tracker, -1
+        self.original, self._frame = tracker, -1
         self._last, self._live = -1, np.zeros(0, np.int64)
         if not isinstance(self.latency_frames, int | np.integer) or self.latency_frames < 0:
             raise self._bad("latency_frames", repr(self.latency_frames), "a whole number of frames from 0")
 
-    def __getattr__(self, name: str) -> Any:
-        if name == "_tracker":  # while it is copied or unpickled there is none yet
-            raise AttributeError(name)
-        return getattr(self._tracker, name)
-
     def start(self, frame: Frame, camera: Camera | None = None) -> None:
         """Begin a stream at this frame."""
         self._frame, self._last, self._live = frame.index, -1, np.zeros(0, np.int64)
-        self._tracker.start(frame, camera)
+        self.original.start(frame, camera)
 
     def add(self, uv_px: np.ndarray) -> np.ndarray:
         """Add queries (N, 2) in the newest frame; returns their ids (N,), above all that were given before."""
-        ids, n = self._tracker.add(uv_px), len(uv_px)
+        ids, n = self.original.add(uv_px), len(uv_px)
         if not isinstance(ids, np.ndarray) or ids.dtype.kind not in "iu" or ids.shape != (n,):
             raise self._bad("add()", kind_of(ids), f"the ids of {n} points, a NumPy array ({n},) of whole numbers")
         if (falls := np.flatnonzero(np.diff(ids.astype(np.int64), prepend=self._last) <= 0)).size:
@@ -61,20 +56,20 @@ class CheckedTracker:
     def track(self, frame: Frame, search: np.ndarray | None = None, urgent: bool = False) -> Tracks:
         """Follow all live queries into the next frame."""
         self._frame = frame.index
-        return self._checked("track()", lambda: self._tracker.track(frame, search, urgent))
+        return self._checked("track()", lambda: self.original.track(frame, search, urgent))
 
     def drop(self, ids: np.ndarray) -> None:
         """Forget these queries for good."""
         self._live = self._live[~np.isin(self._live, ids)]
-        self._tracker.drop(ids)
+        self.original.drop(ids)
 
     def reject(self, ids: np.ndarray) -> None:
         """Handed on."""
-        self._tracker.reject(ids)
+        self.original.reject(ids)
 
     def suggest(self, ids: np.ndarray, uv_px: np.ndarray) -> Tracks | None:
         """Handed on; the newest frame's tracks, or None."""
-        return self._checked("suggest()", lambda: self._tracker.suggest(ids, uv_px), or_none=True)
+        return self._checked("suggest()", lambda: self.original.suggest(ids, uv_px), or_none=True)
 
     def _checked(self, call: str, answer: Callable[[], Any], or_none: bool = False) -> Any:
         """Tracks with a row for each live query, sorted, of which what is visible is somewhere."""
@@ -111,4 +106,4 @@ class CheckedTracker:
         return tracks
 
     def _bad(self, call: str, got: str, expected: str, fix: str = "") -> BadInput:
-        return bad_answer("tracker", self._tracker, self._frame, call, got, expected, fix)
+        return bad_answer("tracker", self.original, self._frame, call, got, expected, fix)

@@ -75,6 +75,11 @@ def shares(part: np.ndarray, holds: np.ndarray, fewest: int) -> np.ndarray:
     return (np.bincount(part, holds) / np.maximum(count, 1))[count >= fewest]
 
 
+def mask_iou(one: np.ndarray, other: np.ndarray) -> float:
+    """Intersection over union of two masks (H, W) bool; 0 where both are empty."""
+    return float(np.count_nonzero(one & other) / max(int(np.count_nonzero(one | other)), 1))
+
+
 def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
     """(H, W) bool: what any of some masks holds; None holds nothing."""
     return reduce(np.logical_or, (mask for mask in masks if mask is not None))  # its ufunc would copy all of them first

@@ -5,13 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, Rows, Tracks
+
+
+class Wrapper:
+    """Stands for its ``original``, which has whatever it has not itself."""
+
+    original: Any
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "original":  # while it is copied or unpickled there is none yet
+            raise AttributeError(name)
+        return getattr(self.original, name)
 
 
 class PointTracker(Protocol):

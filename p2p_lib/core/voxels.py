@@ -24,7 +24,7 @@ _AT_ONCE = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class MaskedImage:
     """A masked RGB-D image, cut to the pixels that count, and the voxels that it may touch.
 
     depth_m   (h, w) float32, -inf on the border and wherever nothing is to be fused
@@ -79,7 +79,7 @@ class CpuGrid:
         """A NumPy copy of one of the arrays."""
         return array.copy()
 
-    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
+    def fuse(self, image: MaskedImage, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
         """Take an image into the means, or out with a negative weight; returns how many voxels it touched.
 
         A, b   (3, 3), (3,): u z, v z and z of lattice point (i, j, k) are A (i, j, k) + b
@@ -183,7 +183,7 @@ class TorchGrid(CpuGrid):
         """A NumPy copy of one of the tensors."""
         return array.cpu().numpy().copy()
 
-    def fuse(self, image: Image, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
+    def fuse(self, image: MaskedImage, A, b, first: np.ndarray, weight: float, tau_m: float, carve: bool) -> int:
         """As on the CPU."""
         import torch
 

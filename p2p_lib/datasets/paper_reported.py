@@ -42,7 +42,7 @@ class Row(Strict):
     std: float | None = None
 
 
-class Table(Strict):
+class ReportedTable(Strict):
     """A typeset table. ``label`` is its LaTeX label, ``dataset`` the manifest's name."""
 
     label: Text
@@ -52,7 +52,7 @@ class Table(Strict):
     rows: list[Row]
 
     @model_validator(mode="after")
-    def _rectangular(self) -> Table:
+    def _rectangular(self) -> ReportedTable:
         for row in self.rows:
             if len(row.values) not in (0, len(self.columns)):
                 raise ValueError(f"{row.method} {row.metric}: {len(row.values)} values for {len(self.columns)} columns")
@@ -74,10 +74,10 @@ class PaperReported(Strict):
     """All of it."""
 
     citation: Text
-    tables: list[Table]
+    tables: list[ReportedTable]
     text: list[Statement]
 
-    def table(self, label: str) -> Table:
+    def table(self, label: str) -> ReportedTable:
         """The table of this LaTeX label."""
         found = [table for table in self.tables if table.label == label]
         if not found:

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.interfaces import Wrapper
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import Sequence
 
 
 @dataclass(frozen=True, eq=False)
-class Resized:
+class Resized(Wrapper):
     """A :class:`~p2p_lib.datasets.sequence.Sequence` scaled by a factor up to 4.
 
     Colour is averaged over areas, or interpolated where it is enlarged, which shows what more pixels cost, not what
     they gain; depth and masks are taken from the nearest pixel, since averages across an edge are neither of its sides.
-    ``visible_px`` stays the original's, so that the same frames are scored.
+    Names, times, truth and ``visible_px`` stay the original's, so that the same frames are scored.
     """
 
     original: Sequence
@@ -51,10 +51,6 @@ class Resized:
 
     def __len__(self) -> int:
         return len(self.original)
-
-    def __getattr__(self, name: str) -> Any:
-        """The original's names, times, truth, models and sizes of masks."""
-        return getattr(self.original, name)
 
 
 def resized_prompt(prompt: Prompt, scale: float) -> Prompt:

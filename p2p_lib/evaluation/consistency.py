@@ -26,7 +26,7 @@ from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, median_of_known, suspicions
-from p2p_lib.extended.depth_lag import says_so
+from p2p_lib.extended.depth_lag import APART
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -138,7 +138,7 @@ def consistency(
         obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, doubted)
-        doubts = tuple(text for text in doubted if _is_about(text, name) and not says_so(text))
+        doubts = tuple(text for text in doubted if _is_about(text, name) and APART not in text)
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
         evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts, moved)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()

@@ -17,7 +17,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.errors import MissingBackend
-from p2p_lib.core.image import in_mask
+from p2p_lib.core.image import in_mask, mask_iou
 from p2p_lib.core.mask_length import CELL_PX, CELLS
 from p2p_lib.core.raycasting import cast, ray_scene
 from p2p_lib.core.types import evenly
@@ -217,5 +217,4 @@ def _through(surface_m: np.ndarray, depth_m: np.ndarray) -> float:
 def _overlap(surface_m: np.ndarray, depth_m: np.ndarray, mask: np.ndarray) -> float:
     """Intersection over union of a drawn surface, where nothing else hides it, and a mask."""
     hidden = (surface_m > 0) & (depth_m > 0) & (depth_m < surface_m - BEFORE_M) & ~mask
-    drawn = (surface_m > 0) & ~hidden
-    return float((drawn & mask).sum() / max((drawn | mask).sum(), 1))
+    return mask_iou((surface_m > 0) & ~hidden, mask)

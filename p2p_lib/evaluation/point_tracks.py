@@ -7,8 +7,6 @@ gone for long is found again. All arrays are (T, N) over frames and points, posi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -62,54 +60,6 @@ def tapvid(
         "jaccard": dict(zip(names, jaccard.tolist(), strict=True)),
         "within": dict(zip(names, within.tolist(), strict=True)),
     }
-
-
-class Outcome(IntEnum):
-    """What came of asking for a point in a frame."""
-
-    NOT_ASKED = 0
-    HIDDEN = 1  # it is, and the tracker says so
-    RIGHT = 2  # visible and found within 8 px
-    MISSED = 3  # visible, but called hidden
-    WRONG = 4  # called visible where it is not
-
-
-def outcomes(
-    uv_true: np.ndarray, visible_true: np.ndarray, uv_px: np.ndarray, visible: np.ndarray, scored: np.ndarray
-) -> np.ndarray:
-    """(T, N) uint8 of :class:`Outcome`; pixels are those of the image as it is."""
-    near = visible_true & (np.linalg.norm(uv_px - uv_true, axis=-1) < FOUND_PX)
-    outcome = np.where(near, Outcome.RIGHT, Outcome.WRONG)
-    silent = np.where(visible_true, Outcome.MISSED, Outcome.HIDDEN)
-    return np.where(scored, np.where(visible, outcome, silent), Outcome.NOT_ASKED).astype(np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """How far off predictions are, by how uncertain they said they were: bins of equally many predictions.
-
-    uncertainty  (B,) median of the bin
-    median_px, p90_px  (B,) error that half, and nine in ten, of the bin stay below
-    rank_correlation  Spearman's, of uncertainty and error over all predictions
-    """
-
-    uncertainty: np.ndarray
-    median_px: np.ndarray
-    p90_px: np.ndarray
-    rank_correlation: float
-
-
-def reliability(error_px: np.ndarray, uncertainty: np.ndarray) -> Reliability:
-    """Errors (M,) of predictions against their uncertainty (M,); equal uncertainties stay in one order."""
-    from scipy.stats import spearmanr
-
-    parts = [part for part in np.array_split(np.argsort(uncertainty, kind="stable"), 10) if len(part)]
-    return Reliability(
-        np.array([np.median(uncertainty[part]) for part in parts]),
-        np.array([np.median(error_px[part]) for part in parts]),
-        np.array([np.quantile(error_px[part], 0.9) for part in parts]),
-        float(spearmanr(uncertainty, error_px).statistic) if len(error_px) > 1 else float("nan"),
-    )
 
 
 def redetections(

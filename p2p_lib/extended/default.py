@@ -31,7 +31,7 @@ from p2p_lib.extended.policy import OurPolicy
 from p2p_lib.extended.reacquisition import Reacquisition
 from p2p_lib.extended.remembered import Remembered
 from p2p_lib.extended.saving import Savable
-from p2p_lib.extended.scene import Scene
+from p2p_lib.extended.scene import CameraTracker
 from p2p_lib.extended.two_maps import OurTracker, TwoMaps
 from p2p_lib.method import pipeline
 
@@ -209,7 +209,7 @@ def compose(camera: Camera, config: Config) -> pipeline.Parts:
         return pipeline.Parts()
     scene = None
     if "scene" in on:
-        scene = Scene(camera, config.depth, np.random.default_rng([config.seed, 2]))
+        scene = CameraTracker(camera, config.depth, np.random.default_rng([config.seed, 2]))
     front = partial(Reacquisition, on=on, scene=scene)
     guard = FrameGuard("moments" in on, DepthLag() if "lag" in on else None)
     return pipeline.Parts(guard, front, partial(object_tracker, on=on))

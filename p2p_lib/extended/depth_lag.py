@@ -35,7 +35,9 @@ _MIN_STEPS = 150
 _MIN_FIT, _MIN_GAIN = 0.3, 0.1
 #: A way that is too short to tell, as a fraction of the image's width; and an offset after which a camera is known to
 #: take the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
-_SHORT, _APART = 0.005, 0.02
+_SHORT, _OFF = 0.005, 0.02
+#: How a run says, in its doubts, that it moves depth onto its colour.
+APART = "of different moments while the camera moves"
 
 
 class DepthLag:
@@ -52,7 +54,7 @@ class DepthLag:
     @property
     def doubt(self) -> tuple[str, str]:
         """What is wrong with a camera that takes them apart, in words, and what to do."""
-        got = f"of different moments while the camera moves, {self.off_px:.0f} px apart"
+        got = f"{APART}, {self.off_px:.0f} px apart"
         return got, "Depth is moved onto colour from then on; poses are better of a camera that takes both together."
 
     def moved(self, frame: Frame) -> np.ndarray | None:
@@ -62,8 +64,8 @@ class DepthLag:
             return None
         height, width = frame.shape
         way_px = float(np.hypot(*per_frame @ [width / 2, height / 2, 1]))
-        share = _late(frame, per_frame) if way_px > (_SHORT if self.off_px else _APART) * width else 0.0
-        if not self.off_px and abs(share) * way_px > _APART * width:
+        share = _late(frame, per_frame) if way_px > (_SHORT if self.off_px else _OFF) * width else 0.0
+        if not self.off_px and abs(share) * way_px > _OFF * width:
             self.off_px = abs(share) * way_px
         if not share or not self.off_px:
             return None
@@ -91,18 +93,13 @@ class DepthLag:
         return motion
 
 
-def says_so(doubt: str) -> bool:
-    """Whether a doubt is that of a run that moves depth onto its colour."""
-    return DepthLag().doubt[0].partition(",")[0] in doubt
-
-
 def as_the_run_took(sequence: Sequence, i: int, doubts: Iterable[str]) -> Frame:
     """Frame i of a run's sequence, its depth moved onto its colour where the run had to do so.
 
     doubts  of the run (``run.json``)
     """
     frame, lag = sequence.frame(i), DepthLag()
-    if not i or not any(map(says_so, doubts)):
+    if not i or not any(APART in doubt for doubt in doubts):
         return frame
     lag.off_px = 1.0  # small offsets count, too
     lag.moved(sequence.frame(i - 1))

@@ -1,7 +1,8 @@
 """Whether a pose stands, and whether its frame is learnt from.
 
 :data:`GATES` are the reasons to refuse a pose; :data:`DOUBTS` are the reasons to learn nothing from it, since depth or
-masks contradict earlier ones. Each is the mechanism of its name. The paper refuses none.
+masks contradict earlier ones; :data:`PROOFS` say what confirms a return on few points. Each is the mechanism of its
+name. The paper refuses none.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def judge(life: Lifecycle, evidence: PoseEvidence, on: Container[str], config: L
             return Judgement(True, Status.DEGRADED, reason, doubted=True)
     if evidence.support < config.return_inliers:
         few = f"only {evidence.support} points agree with the pose, fewer than {config.return_inliers}"
-        proven = "return_gate" not in on or evidence.sighting is None or _sighted(life, evidence)
+        proven = all(proves(life, evidence) for name, proves in PROOFS.items() if name in on)
         return Judgement(True, Status.DEGRADED, few, proven=proven)
     return Judgement(True, Status.RECOVERED if life.returning else Status.TRACKED)
 
@@ -93,6 +94,10 @@ def _few_points_on_return(life: Lifecycle, evidence: PoseEvidence, config: Lifec
     found = _sighted(life, evidence) or on_its_way
     few = life.unconfirmed and evidence.support < config.return_inliers and not found
     return f"only {evidence.support} points agree with the pose of a return" if few else ""
+
+
+def _found_where_looked_for(life: Lifecycle, evidence: PoseEvidence) -> bool:
+    return evidence.sighting is None or _sighted(life, evidence)
 
 
 def _no_points_and_off_surface(life: Lifecycle, evidence: PoseEvidence, config: LifecycleConfig) -> str:
@@ -135,6 +140,9 @@ DOUBTS: dict[str, Callable[[Lifecycle, PoseEvidence], str]] = {
     "outline": _mask_off_steps,
     "still": _same_image,
 }
+
+#: What a pose that few points agree with needs to confirm a return: state and evidence to whether it has it.
+PROOFS: dict[str, Callable[[Lifecycle, PoseEvidence], bool]] = {"return_gate": _found_where_looked_for}
 
 #: Every reason to refuse a pose, in this order: state, evidence and bounds to words, or "".
 GATES: dict[str, Callable[[Lifecycle, PoseEvidence, LifecycleConfig], str]] = {

@@ -184,7 +184,7 @@ class ImageSearch:
         """The best poses near distinct turns, aligned."""
         if len(sample.p_obj) < _FEWEST or not len(cloud) or not len(turns):
             return []
-        poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in laid_on(turns, cloud, sample)])
+        poses = np.concatenate([_shifted(T, _NEAR_M, 1) for T in centred_on_cloud(turns, cloud, sample)])
         share, distinct = self._roughly(poses, sample), []
         turn_of, free = np.arange(len(poses)) // (len(poses) // len(turns)), np.ones(len(turns), bool)
         for k in np.argsort(-share, kind="stable"):
@@ -355,7 +355,7 @@ def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: Surface
     return _STAY_PER_M * np.linalg.norm(away, axis=-1)[..., 0]
 
 
-def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+def centred_on_cloud(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.ndarray:
     """(V, 4, 4) poses of these turns with their camera-facing points centred on the cloud (M, 3)."""
     centre, poses = cloud.mean(0), turns.copy()
     for T in poses:
@@ -364,7 +364,7 @@ def laid_on(turns: np.ndarray, cloud: np.ndarray, sample: SurfaceSample) -> np.n
     return poses
 
 
-def laid_at(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.ndarray:
+def centred_at_points(turns: np.ndarray, p_cam: np.ndarray, sample: SurfaceSample) -> np.ndarray:
     """(V * P, 4, 4) poses of turns (V, 4, 4) with what faced the camera then centred on points (P, 3)."""
     poses = np.repeat(turns, len(p_cam), 0)
     for k, T in enumerate(turns):

@@ -20,7 +20,7 @@ from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
 from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge
 from p2p_lib.extended.graph import explained
-from p2p_lib.extended.image_search import laid_on
+from p2p_lib.extended.image_search import centred_on_cloud
 from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
 from p2p_lib.extended.model import OurKnown
 from p2p_lib.extended.motion import motion_weight
@@ -160,7 +160,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         if motion is None or not (self.carried(known, time_s) and len(obs.cloud) and self.shape.knows(known)):
             return {}
         T_cam_obj = motion.at(time_s)
-        (on_depth,) = laid_on(T_cam_obj[None], obs.cloud, self.shape.sample(known.model))
+        (on_depth,) = centred_on_cloud(T_cam_obj[None], obs.cloud, self.shape.sample(known.model))
         near = np.linalg.norm(on_depth[:3, 3] - T_cam_obj[:3, 3]) < motion.reach_m(time_s)
         return {"motion": T_cam_obj} | ({"motion, on its depth": on_depth} if near else {})
 

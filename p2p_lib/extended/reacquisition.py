@@ -22,7 +22,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.remembered import Remembered, follow
-from p2p_lib.extended.scene import Scene
+from p2p_lib.extended.scene import CameraTracker
 from p2p_lib.extended.two_maps import TwoMaps
 from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
 from p2p_lib.method.object_model import Requests
@@ -43,7 +43,7 @@ class Reacquisition(Frontend):
         stopwatch: Stopwatch,
         executor: Executor,
         on: Container[str],
-        scene: Scene | None,
+        scene: CameraTracker | None,
     ):
         # To the paper's steps an object's two maps are its ObjectTracker, but for hint(), which is not asked for here.
         super().__init__(camera, tracker, segmenter, cast(Any, objects), stopwatch, executor)
@@ -136,7 +136,7 @@ class Reacquisition(Frontend):
             seen[name] = self.maps[name].observe(inputs.frame, mask, self.tracks, self._sightings.get(name), *by_whom)
         if "rejection" in self.on:
             self.apply(self._misplaced(seen, inputs.masks))
-        return seen | self._redetect(inputs.frame, seen) if "redetection" in self.on else seen
+        return seen | self._redetect(seen) if "redetection" in self.on else seen
 
     def _misplaced(self, seen: Mapping[str, OurObservation], given: Masks) -> dict[str, Requests]:
         """Tracks of absent objects that are on something else.
@@ -148,7 +148,7 @@ class Reacquisition(Frontend):
         within = {name: elsewhere if name in nowhere else obs.mask for name, obs in seen.items()}
         return {name: self.maps[name].outlook.misplaced(obs, within[name]) for name, obs in seen.items()}
 
-    def _redetect(self, frame: Frame, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
+    def _redetect(self, seen: Mapping[str, OurObservation]) -> dict[str, OurObservation]:
         """Guided re-detection: the tracker looks for points where objects expect them; the new observations."""
         looked = {name: self.maps[name].outlook.expected_px(obs) for name, obs in seen.items()}
         expected = {name: uv_px for name, uv_px in looked.items() if uv_px is not None}

@@ -24,7 +24,7 @@ from p2p_lib.core.interfaces import PointTracker
 from p2p_lib.core.memory import ObjectMemory
 from p2p_lib.core.types import Frame, Status, Tracks, joined
 from p2p_lib.extended.agreement import outline_share
-from p2p_lib.extended.image_search import ImageSearch, Sighting, laid_at
+from p2p_lib.extended.image_search import ImageSearch, Sighting, centred_at_points
 from p2p_lib.extended.observation import OurObservation
 from p2p_lib.extended.two_maps import OurTracker, TwoMaps
 from p2p_lib.method.object_model import CONFIRM_FRAMES, Known, Requests
@@ -190,7 +190,7 @@ class Remembered(TwoMaps):
         turns = self.model.views.some(_TURNS)
         free = np.ones(frame.shape, bool) if mask is None else mask
         free = free if taken is None else free & ~taken
-        poses = [laid_at(turns, search.places(free, sample, self._rng), sample)]
+        poses = [centred_at_points(turns, search.places(free, sample, self._rng), sample)]
         for T in turns:
             one = np.repeat(T[None], len(pairs), 0)
             one[:, :3, 3] = pairs.p_cam - p_obj[pairs.rows] @ T[:3, :3].T

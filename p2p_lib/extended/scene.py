@@ -45,7 +45,7 @@ class _View:
     T_world_cam: np.ndarray
 
 
-class Scene:
+class CameraTracker:
     """Tracks the camera in the world, the frame of the first camera, while it sees places that it has seen before."""
 
     def __init__(self, camera: Camera, config: DepthConfig, rng: np.random.Generator):

@@ -21,8 +21,7 @@ from p2p_lib.benchmark.plan import Method
 from p2p_lib.benchmark.rows import MEAN, POOLED, shown_name
 from p2p_lib.core.files import replace_text
 from p2p_lib.datasets import manifests
-from p2p_lib.datasets.paper_reported import FAIL, Row, paper_reported
-from p2p_lib.datasets.paper_reported import Table as Reported
+from p2p_lib.datasets.paper_reported import FAIL, ReportedTable, Row, paper_reported
 from p2p_lib.datasets.sequence import SYNTHETIC
 from p2p_lib.figures.numbers import AREA_HEADS, AREA_KEYS, METRICS, Numbers, is_whole_dataset
 from p2p_lib.figures.run_tables import by_fault, by_grid, by_pair, by_run
@@ -99,12 +98,12 @@ def by_object(numbers: Numbers) -> Table:
     return Table(numbers.plan.title, heads, rows, groups, words=2, rules=rules, notes=numbers.notes())
 
 
-def _columns(paper: Reported) -> dict[str, tuple[str, str]]:
+def _columns(paper: ReportedTable) -> dict[str, tuple[str, str]]:
     """Column to the sequence and the object that it is of."""
     return {f"{c.sequence} {c.object}".strip(): (c.sequence, c.object) for c in paper.columns}
 
 
-def _metrics(numbers: Numbers, paper: Reported) -> list[str]:
+def _metrics(numbers: Numbers, paper: ReportedTable) -> list[str]:
     printed = {row.metric for row in paper.rows}
     return [metric for metric in METRICS if metric in printed and (metric in AREA_KEYS or numbers.plan.chamfer)]
 
@@ -128,13 +127,13 @@ def _places(numbers: Numbers, method: str = "") -> dict[str, tuple[Job, str]]:
     return places
 
 
-def _own_columns(numbers: Numbers, paper: Reported) -> dict[str, tuple[str, str]]:
+def _own_columns(numbers: Numbers, paper: ReportedTable) -> dict[str, tuple[str, str]]:
     """The same of ours that the paper does not have."""
     known, places = _columns(paper), _places(numbers).items()
     return {column: (shown_name(job), name) for column, (job, name) in places if column not in known}
 
 
-def _lines(numbers: Numbers, paper: Reported, metric: str) -> list[_Line]:
+def _lines(numbers: Numbers, paper: ReportedTable, metric: str) -> list[_Line]:
     """All methods of a metric, the reported ones first, with the best in bold."""
     lines = [_reported_line(paper, row) for row in paper.rows if row.metric == metric]
     for method in numbers.methods:
@@ -148,7 +147,7 @@ def _lines(numbers: Numbers, paper: Reported, metric: str) -> list[_Line]:
     return lines
 
 
-def _reported_line(paper: Reported, row: Row) -> _Line:
+def _reported_line(paper: ReportedTable, row: Row) -> _Line:
     columns = _columns(paper)
     printed = [Cell(FAIL) if value == FAIL else number(float(value)) for value in row.values]
     name = "Point2Pose" if row.method == "Ours" else row.method
@@ -157,7 +156,7 @@ def _reported_line(paper: Reported, row: Row) -> _Line:
     return _Line("CAD" if row.cad else "CAD-free", f"{name} (reported)", cells, comparable)
 
 
-def _our_line(numbers: Numbers, paper: Reported, metric: str, form: str, method: Method) -> _Line:
+def _our_line(numbers: Numbers, paper: ReportedTable, metric: str, form: str, method: Method) -> _Line:
     absent = numbers.not_planned(method.name)
     columns, cells, whole, same = _columns(paper), defaultdict(lambda: absent), set(), set()
     frames = {shown_name(j): o.ran.get("frames") for j, o in numbers.benchmark.results if j.method.name == method.name}

@@ -100,7 +100,7 @@ class Numbers:
 
     def scored(self) -> str:
         """Which frames count."""
-        return f"frames with less than {self.plan.min_mask_px} pixels of an object's mask are not scored"
+        return f"frames with less than {self.plan.min_visible_px} pixels of an object's mask are not scored"
 
     def about(self) -> list[str]:
         """What the plan itself has to say below its table, and what ran."""

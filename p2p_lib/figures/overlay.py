@@ -34,7 +34,7 @@ EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (_SIGNS[a
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class OrientedBox:
     """A box around an object: its centre and axes in the object's frame, and its edge lengths.
 
     T_obj_box  (4, 4); size_m (3,)
@@ -53,7 +53,7 @@ class Box:
         return se3.transform(T_cam_obj @ self.T_obj_box, _SIGNS * np.asarray(self.size_m, float) / 2)
 
     @classmethod
-    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY) -> Box:
+    def around(cls, points: np.ndarray, T_obj_points: np.ndarray = se3.IDENTITY) -> OrientedBox:
         """The box of points (N, 3) along the axes of their own frame."""
         points = np.asarray(points, float)
         points = points[np.isfinite(points).all(1)]
@@ -63,14 +63,14 @@ class Box:
         return cls(T_obj_points @ se3.from_rt(np.eye(3), (low + high) / 2), high - low)
 
 
-def tight_box(mesh: trimesh.Trimesh) -> Box:
+def tight_box(mesh: trimesh.Trimesh) -> OrientedBox:
     """The smallest box around a surface, along its own axes."""
     T_box_obj, size_m = oriented_box(mesh)
-    return Box(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
+    return OrientedBox(se3.orthonormalised(se3.inverse(T_box_obj)), size_m)
 
 
 def draw_box(
-    image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, box: Box, colour: str, dashed: bool = False
+    image: np.ndarray, camera: Camera, T_cam_obj: np.ndarray, box: OrientedBox, colour: str, dashed: bool = False
 ) -> np.ndarray:
     """A box's edges; those behind it are thin, and so is a dashed box."""
     p_cam, front = box.corners(T_cam_obj), _front_edges(T_cam_obj @ box.T_obj_box, box.size_m)

@@ -15,7 +15,7 @@ from p2p_lib.datasets.sequence import Sequence as Video
 from p2p_lib.evaluation.protocol import Evaluation
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.overlay import Box, Label
+from p2p_lib.figures.overlay import Label, OrientedBox
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
 
@@ -38,7 +38,7 @@ class Scene:
         sequence: Video,
         run: Run,
         evaluation: Evaluation | None = None,
-        boxes: Mapping[str, Box] | None = None,
+        boxes: Mapping[str, OrientedBox] | None = None,
         truth: bool = True,
         objects: Mapping[str, ObjectRun] | None = None,
     ):
@@ -54,9 +54,9 @@ class Scene:
         self.sequence, self.run, self.objects = sequence, run, objects or run.objects
         known = set(run.objects) <= set(sequence.objects)  # a folder without masks knows no names
         self.colours = style.object_colours(sequence.objects if known else run.objects)
-        self._model_boxes = {name: Box.around(points) for name, points in run.points.items()} if truth else {}
+        self._model_boxes = {name: OrientedBox.around(points) for name, points in run.points.items()} if truth else {}
         kept = {name: obj.kept_map for name, obj in self.objects.items()}
-        self._boxes: dict[tuple[str, int], Box] = {}  # of an object's map, in the frame of that map
+        self._boxes: dict[tuple[str, int], OrientedBox] = {}  # of an object's map, in the frame of that map
         for name, score in evaluation.objects.items() if evaluation else ():
             obj, points = self.objects[name], run.points.get(name)
             if points is None or not np.isfinite(score.T_obj_model).all():
@@ -64,8 +64,8 @@ class Scene:
             both = np.flatnonzero(obj.has_pose & obj.has_truth)
             for k in both[np.unique(obj.map_id[both], return_index=True)[1]].tolist():  # the first of each map
                 T_obj_model = se3.inverse(obj.T_cam_obj[k]) @ obj.T_cam_model[k]
-                self._boxes[name, int(obj.map_id[k])] = Box.around(points, T_obj_model)
-            self._boxes[name, kept[name]] = Box.around(points, score.T_obj_model)
+                self._boxes[name, int(obj.map_id[k])] = OrientedBox.around(points, T_obj_model)
+            self._boxes[name, kept[name]] = OrientedBox.around(points, score.T_obj_model)
         self._boxes |= {(name, kept[name]): box for name, box in (boxes or {}).items()}
         self._playback: Playback | None = None
         self._surfaces = False
@@ -166,7 +166,7 @@ class Scene:
         margin_px = round(margin * camera.width)
         return overlay.region_around(uv, camera, (margin_px, margin_px))
 
-    def _box(self, name: str, row: int) -> Box | None:
+    def _box(self, name: str, row: int) -> OrientedBox | None:
         """An object's box in the frame of its pose at a row, where there is one."""
         return self._boxes.get((name, int(self.objects[name].map_id[row])))
 
@@ -202,7 +202,7 @@ class Scene:
     def _label(self, camera: Camera, name: str, obj: ObjectRun, row: int) -> Label | None:
         """The object's name and status, at its estimated box, else its true one, else where it was last seen."""
         before = np.flatnonzero(obj.has_pose[: row + 1])
-        box: Box | None
+        box: OrientedBox | None
         if not obj.has_pose[row] and name in self._model_boxes and obj.has_truth[row]:
             box, T_cam_obj = self._model_boxes[name], obj.T_cam_model[row]
         elif len(before):
@@ -251,7 +251,7 @@ def draw_live(
         uv_px = method.camera.project(se3.transform(T_cam_obj, keypoints.p_obj))
         image = overlay.draw_points(image, uv_px[~keypoints.promoted], colours[name], 3, filled=False)
         image = overlay.draw_points(image, uv_px[keypoints.promoted], colours[name], _POINT_PX)
-        image = overlay.draw_box(image, method.camera, T_cam_obj, Box.around(keypoints.p_obj), colours[name])
+        image = overlay.draw_box(image, method.camera, T_cam_obj, OrientedBox.around(keypoints.p_obj), colours[name])
         image = overlay.draw_axes(image, method.camera, T_cam_obj, 0.06)
         low, high = np.nanmin(uv_px, 0), np.nanmax(uv_px, 0)
         text = _status(name, estimate.status, estimate.reason, estimate.confidence <= DOUBTED)

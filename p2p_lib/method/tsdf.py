@@ -19,7 +19,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import TsdfConfig
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.voxels import CpuGrid, Image, TorchGrid
+from p2p_lib.core.voxels import CpuGrid, MaskedImage, TorchGrid
 
 if TYPE_CHECKING:
     import trimesh
@@ -41,7 +41,7 @@ _CARVE_MARGIN_PX = 1
 
 
 @dataclass(frozen=True, eq=False)
-class View(Image):
+class View(MaskedImage):
     """One masked RGB-D observation with a border of a pixel; its box is kept, so that it can be taken out exactly.
 
     corner    column and row in the image of the cut's first pixel inside the border

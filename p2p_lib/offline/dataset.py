@@ -18,6 +18,7 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text
+from p2p_lib.core.image import mask_iou
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, Frame
 from p2p_lib.datasets import images
@@ -71,11 +72,11 @@ def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, ma
     ``p2p eval`` (holes of the depth and what is in front count neither way), and the 90th percentile of its errors, mm.
     """
     surface_m = silhouette.depth_in(depth_m)
-    iou = np.nan if mask is None else np.count_nonzero(shown & mask) / max(int(np.count_nonzero(shown | mask)), 1)
+    iou = np.nan if mask is None else mask_iou(shown, mask)
     both = shown & (depth_m > 0)
     off_m = np.abs(surface_m[both] - depth_m[both])
     off_mm = float(1000 * np.quantile(off_m, 0.9)) if len(off_m) else np.nan
-    return float(iou), on_surface(np.where(shown, surface_m, 0), depth_m), off_mm
+    return iou, on_surface(np.where(shown, surface_m, 0), depth_m), off_mm
 
 
 def doubtful(confidence: float, iou: float, on: float) -> bool:

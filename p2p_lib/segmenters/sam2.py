@@ -23,7 +23,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
-from p2p_lib.core.image import in_mask
+from p2p_lib.core.image import in_mask, mask_iou
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
@@ -84,10 +84,10 @@ class Question:
     looks: np.ndarray | None = None
 
     @classmethod
-    def of_prompt(cls, prompt: Prompt, found: np.ndarray, others_px: np.ndarray, corrects: bool) -> Question:
-        """Of a prompt and the mask (H, W) bool that the built-in segmenter made of it; ``corrects`` one that was."""
+    def of_prompt(cls, prompt: Prompt, found: np.ndarray, others_px: np.ndarray, mends: bool) -> Question:
+        """Of a prompt and the mask (H, W) bool that the built-in segmenter made of it; ``mends`` one that was."""
         own_px = prompt.points_px
-        if corrects:  # a click on a part is not meant to select that part alone
+        if mends:  # a click on a part is not meant to select that part alone
             own_px = np.concatenate([own_px, _spread(_middle(found), _MIDDLE)])
         asked = replace(prompt, points_px=own_px) if len(own_px) else prompt
         return cls(asked, own_px, np.concatenate([prompt.negative_px, others_px]))
@@ -123,7 +123,7 @@ class Question:
         fits = (own >= _OWN) & (others <= _OTHERS) & (offered.score >= _LEAST_SCORE)
         worth = worth + own - others
         if self.expected is not None:
-            overlap = np.array([_iou(mask, self.expected) for mask in masks])
+            overlap = np.array([mask_iou(mask, self.expected) for mask in masks])
             fits, worth = fits & (overlap >= _LEAST_OVERLAP), worth + _OVERLAP * overlap
         if self.looks is not None:
             alike = np.array([self._alike(mask, features) for mask in masks])
@@ -195,13 +195,13 @@ class Sam2Refiner:
         prompts: Mapping[str, Prompt],
         found: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
-        corrected: Collection[str] = (),
+        mended: Collection[str] = (),
     ) -> dict[str, np.ndarray]:
         """Better masks (H, W) bool of some of the objects in this frame.
 
-        prompts    those of this frame that are no masks
-        found      every object that the segmenter located, to its mask (H, W) bool, which may be empty
-        corrected  the objects whose masks the prompts correct
+        prompts  those of this frame that are no masks
+        found    every object that the segmenter located, to its mask (H, W) bool, which may be empty
+        mended   the objects whose masks the prompts mend
         """
         executor = self._executor if self._frames else None  # the first image waits
         due = self._every is not None and (executor is not None or self._frames % self._every == 0)
@@ -210,7 +210,7 @@ class Sam2Refiner:
             self._working = None  # what is thought of it is wrong, as the answer to come may be
         self._place(frame, hints)
         arrived = self._arrived(frame, found, hints)
-        if self._working is None and (questions := self._questions(frame, prompts, found, hints, corrected, due)):
+        if self._working is None and (questions := self._questions(frame, prompts, found, hints, mended, due)):
             T_cam_obj = {name: hints.get(name, _NO_HINT).T_cam_obj for name in questions}
             if executor is None:
                 answers = _answers(self._network, frame, questions)
@@ -234,7 +234,7 @@ class Sam2Refiner:
         prompts: Mapping[str, Prompt],
         found: Mapping[str, np.ndarray],
         hints: Mapping[str, Hint],
-        corrected: Collection[str],
+        mended: Collection[str],
         followed: bool,
     ) -> dict[str, Question]:
         """By object; of the ``followed`` ones too, or of those with prompts alone."""
@@ -244,7 +244,7 @@ class Sam2Refiner:
         for name in names:
             others_px = np.concatenate([_NO_PX, *(px for other, px in known_px.items() if other != name)])
             if name in prompts:
-                questions[name] = Question.of_prompt(prompts[name], found[name], others_px, name in corrected)
+                questions[name] = Question.of_prompt(prompts[name], found[name], others_px, name in mended)
                 self._answered.pop(name, None)  # what was thought of it was wrong
                 continue
             hint, known = hints.get(name, _NO_HINT), self._answered.get(name)
@@ -335,10 +335,6 @@ def _spread(uv_px: np.ndarray, count: int) -> np.ndarray:
 def _shares(uv_px: np.ndarray, masks: Iterable[np.ndarray], none: float) -> np.ndarray:
     """(C,) the share of the pixels (N, 2) in each mask; ``none`` where there are no pixels."""
     return np.array([in_mask(uv_px, mask).mean() if len(uv_px) else none for mask in masks])
-
-
-def _iou(one: np.ndarray, other: np.ndarray) -> float:
-    return np.count_nonzero(one & other) / max(1, int(np.count_nonzero(one | other)))
 
 
 def _without_flaws(mask: np.ndarray) -> np.ndarray:

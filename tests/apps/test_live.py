@@ -23,7 +23,7 @@ import pytest
 import trimesh
 
 from p2p_lib.apps import cli
-from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
+from p2p_lib.apps.live import LiveOptions, _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import KEPT, Words, outlet
 from p2p_lib.core.camera import Camera
@@ -124,7 +124,7 @@ def test_a_few_frames_wait_their_turn(scripted):
 
 def test_a_backlog_below_none_is_refused(folder):
     with pytest.raises(BadInput, match=r"backlog.*-1"):
-        track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, print, backlog=-1)
+        track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, print, live=LiveOptions(backlog=-1))
 
 
 def test_frames_that_must_not_be_dropped_wait(scripted):
@@ -230,7 +230,7 @@ def test_slow_processing_drops_frames_and_counts_them(folder):
 def test_a_tracker_that_is_made_already_is_taken(folder):
     got: list[PoseEstimate] = []
     options = RunOptions(settings=SETTINGS, tracker=LkTracker(preset().tracking, np.random.default_rng(0)), stop=4)
-    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, options, backlog=1000)
+    track_live(FolderCamera(open_sequence(folder), 20), PROMPTS, got.append, options, LiveOptions(backlog=1000))
     assert [estimate.frame_index for estimate in got] == [0, 1, 2, 3]
 
 
@@ -292,15 +292,15 @@ def test_a_camera_that_gives_no_image_is_told_from_a_wrong_frame():
 def test_a_run_is_kept_and_filmed(folder, tmp_path):
     """What is kept is what was said, and it can be looked at; the film has an image a frame."""
     sequence, got = open_sequence(folder), []
-    where = {"out": tmp_path / "run", "overlay": tmp_path / "film.mp4"}
-    count = track_live(FolderCamera(sequence, 20), PROMPTS, got.append, RunOptions(settings=SETTINGS), **where)
-    kept = load_run(where["out"])
+    live = LiveOptions(out=tmp_path / "run", overlay=tmp_path / "film.mp4")
+    count = track_live(FolderCamera(sequence, 20), PROMPTS, got.append, RunOptions(settings=SETTINGS), live)
+    kept = load_run(live.out)
     board = kept.objects["board"]
     np.testing.assert_allclose(board.T_cam_obj, [e.T_cam_obj for e in got])
     assert board.frame_index.tolist() == [e.frame_index for e in got] and len(got) == count.frames
     assert kept.info["finished"] and kept.info["segmenter"] == "builtin" and kept.info["path"] == str(folder)
-    assert len(load_keypoints(where["out"])["board"].ids) > 10
-    write_film(where["out"], tmp_path / "again.mp4")
+    assert len(load_keypoints(live.out)["board"].ids) > 10
+    write_film(live.out, tmp_path / "again.mp4")
     for film in ("film.mp4", "again.mp4"):
         with av.open(str(tmp_path / film)) as container:
             assert sum(1 for _ in container.decode(video=0)) == count.frames
@@ -318,7 +318,7 @@ def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):
         scripted.hand.put(sequence.frame(estimate.frame_index + 1))
 
     with pytest.raises(KeyboardInterrupt):
-        track_live(scripted, PROMPTS, stop, RunOptions(settings=SETTINGS), out=tmp_path / "run")
+        track_live(scripted, PROMPTS, stop, RunOptions(settings=SETTINGS), LiveOptions(out=tmp_path / "run"))
     kept = load_run(tmp_path / "run")
     assert kept.info["finished"] and len(kept.objects["board"]) == 2 and kept.info["path"] is None
     assert load_keypoints(tmp_path / "run")
@@ -340,7 +340,7 @@ def test_stopping_a_camera_while_a_frame_is_written_keeps_the_frames_before_it(s
     for k in range(3):
         scripted.hand.put(sequence.frame(k))
     with pytest.raises(KeyboardInterrupt):
-        track_live(scripted, PROMPTS, go_on, RunOptions(settings=SETTINGS), out=tmp_path / "run")
+        track_live(scripted, PROMPTS, go_on, RunOptions(settings=SETTINGS), LiveOptions(out=tmp_path / "run"))
     kept = load_run(tmp_path / "run")
     assert kept.info["finished"] and len(kept.objects["board"]) == len(kept.timings["total_ms"]) == kept.info["frames"]
 
@@ -440,8 +440,8 @@ def test_a_pose_of_too_little_confidence_is_null_and_says_so(folder, tmp_path, c
 def test_known_sizes_are_compared_with_what_a_camera_sees(cm, said, folder, tmp_path):
     camera, heard = AtOnce(open_sequence(folder).camera, map(open_sequence(folder).frame, range(6))), []
     options = RunOptions(settings=SETTINGS, sizes={"board": cm})
-    how = {"say": heard.append, "backlog": 10}
-    track_live(camera, PROMPTS, lambda estimate: None, options, out=tmp_path / "run", **how)
+    live = LiveOptions(say=heard.append, backlog=10, out=tmp_path / "run")
+    track_live(camera, PROMPTS, lambda estimate: None, options, live)
     assert re.search(said, heard[-1]), heard
     doubted = any("known to be" in text for text in load_run(tmp_path / "run").info["look_at"]["board"])
     assert doubted == (cm == 3)
@@ -590,7 +590,7 @@ def followed_in_step(folder: Path, before, settings=SETTINGS, **how) -> list[Pos
         patch.setattr("p2p_lib.apps.live.Newest", Asking)
         patch.setattr("p2p_lib.apps.live._warm_up", lambda method: None)
         camera = InStep(sequence.camera)
-        track_live(camera, (), got.append, RunOptions(settings=settings), backlog=20, **how)
+        track_live(camera, (), got.append, RunOptions(settings=settings), LiveOptions(backlog=20, **how))
     return got
 
 
@@ -995,7 +995,9 @@ def test_a_camera_whose_images_all_have_another_size_ends_it(scripted, sizes, co
 def test_a_live_run_says_that_its_images_are_gone(scripted, folder, tmp_path, capsys):
     for given in (*(open_sequence(folder).frame(k) for k in range(3)), None):
         scripted.hand.put(given)
-    track_live(scripted, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS), out=tmp_path / "run")
+    track_live(
+        scripted, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS), LiveOptions(out=tmp_path / "run")
+    )
     for command in (["refine"], ["film", "--out", str(tmp_path / "f.webp")]):
         assert cli.main([command[0], str(tmp_path / "run"), *command[1:]]) == 2
         assert "it was a live camera's, of which none are kept. To have them" in capsys.readouterr().err
@@ -1008,7 +1010,8 @@ def test_frames_up_to_the_stop_are_all_counted(folder):
     for k in (0, 1, 2, 14):
         camera.hand.put(sequence.frame(k))
     said = []
-    count = track_live(camera, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS, stop=12), say=said.append)
+    options = RunOptions(settings=SETTINGS, stop=12)
+    count = track_live(camera, PROMPTS, lambda estimate: None, options, LiveOptions(say=said.append))
     assert (count.frames, count.dropped) == (3, 9) and not [line for line in said if "first masks" in line]
 
 
@@ -1018,7 +1021,8 @@ def test_what_was_dropped_while_the_first_masks_were_made_is_said(folder):
     for k in (0, 5, 7):
         camera.hand.put(sequence.frame(k))
     camera.hand.put(None)
-    count = track_live(camera, PROMPTS, lambda estimate: None, RunOptions(settings=SETTINGS), say=said.append)
+    options = RunOptions(settings=SETTINGS)
+    count = track_live(camera, PROMPTS, lambda estimate: None, options, LiveOptions(say=said.append))
     assert (count.frames, count.dropped) == (3, 5)
     assert said[-1] == "4 images came while the first masks were made, and were dropped"
 
@@ -1044,7 +1048,7 @@ def test_images_after_the_stop_push_none_out(folder, backlog, kept, monkeypatch)
 
     monkeypatch.setattr(Newest, "take", take)
     options = RunOptions(settings=SETTINGS, stop=8)
-    count = track_live(camera, PROMPTS, got.append, options, backlog=backlog)
+    count = track_live(camera, PROMPTS, got.append, options, LiveOptions(backlog=backlog))
     assert [estimate.frame_index for estimate in got] == kept
     assert (count.frames, count.dropped) == (len(kept), 8 - len(kept))
 

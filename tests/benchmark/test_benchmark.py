@@ -92,7 +92,7 @@ def test_mean_and_pool_are_those_of_the_runs(whole):
 def test_frames_in_which_too_little_is_to_be_seen_are_left_out(plan, tmp_path, here):
     here()
     path = tmp_path / "slides.toml"
-    path.write_text("min_mask_px = 1_000_000\n" + plan.read_text())
+    path.write_text("min_visible_px = 1_000_000\n" + plan.read_text())
     found = run_benchmark(path, tmp_path / "out", profile="quick", progress=False)
     assert all("1000000 visible pixels" in outcome.reason for _, outcome in found.results)
     for kind in ("methods", "returns", "runs", "grid", "pairs"):
@@ -138,7 +138,7 @@ def test_a_key_is_of_everything_that_decides_a_result(slides, plan, tmp_path, mo
     assert keys(**{"A board that slides": "Another title", '"Ours"': '"Mine"'}) == same, "names decide nothing"
     assert len(set(same)) == 2
     assert keys(**{"seeds = [0]": "seeds = [4]"})[0] != same[0]
-    assert keys(**{'title = "A': 'min_mask_px = 0\ntitle = "A'})[0] != same[0]
+    assert keys(**{'title = "A': 'min_visible_px = 0\ntitle = "A'})[0] != same[0]
     assert keys(**{'column = "AP10" }': "stop = 4 }"})[0] != same[0]
     assert keys(**{'"method.graph" = false': '"method.graph" = true'})[0] != same[0]
     copy = Path(shutil.copytree(slides[0], tmp_path / "copy"))

@@ -103,13 +103,13 @@ def test_a_frame_at_which_the_tracker_fails_is_left_out(at):
     frames = film()[:8]
     with Point2Pose(CAMERA, quick()) as method:
         method.add_object("left", mask=frames[0][1]["left"])
-        track, found = method.tracker._tracker.track, []
+        track, found = method.tracker.original.track, []
         for frame, masks in frames:
             if frame.index == at:
-                method.tracker._tracker.track = lambda *_: (_ for _ in ()).throw(RuntimeError("a hiccup"))
+                method.tracker.original.track = lambda *_: (_ for _ in ()).throw(RuntimeError("a hiccup"))
                 with pytest.raises(RuntimeError, match="hiccup"):
                     method.step(frame, {"left": masks["left"]})
-                method.tracker._tracker.track = track
+                method.tracker.original.track = track
             else:
                 found.append(method.step(frame, {"left": masks["left"]}))
     assert [each["left"].frame_index for each in found] == [frame.index for frame, _ in frames if frame.index != at]

@@ -4,7 +4,7 @@ import pytest
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.datasets import manifests
-from p2p_lib.datasets.paper_reported import FAIL, Table, paper_reported
+from p2p_lib.datasets.paper_reported import FAIL, ReportedTable, paper_reported
 
 HO3D = "tab:bundlesdf_point2pose_comparison"
 
@@ -91,7 +91,7 @@ def test_numbers_of_the_text():
 def test_a_row_of_the_wrong_length_is_refused():
     row = {"metric": "add_auc", "method": "Ours", "cad": False, "values": [1.0], "mean": 1.0}
     with pytest.raises(ValueError, match="1 values for 2 columns"):
-        Table.model_validate(
+        ReportedTable.model_validate(
             {
                 "label": "t",
                 "title": "t",

@@ -1,5 +1,7 @@
 """A smaller camera at the same place sees the same points at the same places."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -71,3 +73,7 @@ def test_enlarged_and_made_small_again_it_is_what_it_was(half):
 def test_a_scale_that_is_none(scale):
     with pytest.raises(BadInput, match="scale"):
         Resized(open_sequence("synthetic/crossing"), scale)
+
+
+def test_it_can_be_copied(half):
+    assert copy(half).name == half.name

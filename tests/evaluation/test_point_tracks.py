@@ -8,12 +8,9 @@ from hypothesis import strategies as st
 from pandas.testing import assert_frame_equal
 
 from p2p_lib.evaluation.point_tracks import (
-    Outcome,
     after_query,
-    outcomes,
     redetection_shares,
     redetections,
-    reliability,
     tapvid,
 )
 
@@ -191,28 +188,3 @@ def test_many_points_are_the_single_ones():
 def test_no_returns_at_all():
     assert redetection_shares(returns_of(shown((0, 100))))["returns"] == 0
     assert redetection_shares(returns_of(shown()))["returns"] == 0
-
-
-# --- outcomes and reliability ---------------------------------------------------------------------
-
-
-def test_every_outcome_by_hand():
-    uv_true = np.zeros((1, 6, 2))
-    uv = np.array([[[7.9, 0], [8.1, 0], [0, 0], [0, 0], [np.nan, np.nan], [0, 0]]])
-    truly = np.array([[True, True, True, False, False, True]])
-    said = np.array([[True, True, False, True, False, True]])
-    asked = np.array([[True, True, True, True, True, False]])
-    names = [Outcome(k).name for k in outcomes(uv_true, truly, uv, said, asked)[0]]
-    assert names == ["RIGHT", "WRONG", "MISSED", "WRONG", "HIDDEN", "NOT_ASKED"]
-
-
-def test_reliability_of_an_honest_and_of_a_blind_tracker():
-    rng = np.random.default_rng(0)
-    sigma = rng.uniform(1, 6, 20_000)
-    error = np.abs(sigma * rng.normal(size=sigma.shape))
-    honest, blind = reliability(error, sigma), reliability(error, rng.uniform(size=sigma.shape))
-    assert len(honest.uncertainty) == 10
-    np.testing.assert_allclose(honest.median_px, 0.6745 * honest.uncertainty, rtol=0.1)
-    np.testing.assert_allclose(honest.p90_px, 1.645 * honest.uncertainty, rtol=0.15)
-    assert honest.rank_correlation > 0.4 > 0.03 > abs(blind.rank_correlation)
-    assert np.ptp(blind.median_px) < 0.3

@@ -11,7 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.gates import SIGHTED
-from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample, laid_at
+from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample, centred_at_points
 from p2p_lib.method.observation import sample_cloud
 from tests.method import analytic_scene
 
@@ -214,7 +214,7 @@ def test_of_one_colour_with_the_wall_only_the_ball_is_tried():
     looked, sample = search(ball_in_front_of_a_wall(GREY)), sample_of_the_ball(GREY)
     places = looked.places(np.ones((CAMERA.height, CAMERA.width), bool), sample, np.random.default_rng(0))
     assert len(places) > 10 and (places[:, 2] < 0.7).all()
-    found = looked.among(laid_at(PLACE[None], places, sample), sample)
+    found = looked.among(centred_at_points(PLACE[None], places, sample), sample)
     assert found and all(np.linalg.norm(one.T_cam_obj[:3, 3] - PLACE[:3, 3]) < 0.005 for one in found)
 
 

@@ -11,7 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.extended.default import Point2Pose
-from p2p_lib.extended.scene import Scene, two_nearest
+from p2p_lib.extended.scene import CameraTracker, two_nearest
 
 CAMERA = Camera(260.0, 260.0, 160.0, 120.0, 320, 240)
 WALL_M = 1.2
@@ -35,8 +35,8 @@ def moved(x_m: float, turn_deg: float = 0.0) -> np.ndarray:
     return se3.from_rt(cv2.Rodrigues(np.radians([0, turn_deg, 0]))[0], np.array([x_m, 0, 0]))
 
 
-def scene() -> Scene:
-    return Scene(CAMERA, preset().depth, np.random.default_rng(0))
+def scene() -> CameraTracker:
+    return CameraTracker(CAMERA, preset().depth, np.random.default_rng(0))
 
 
 def off(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -152,9 +152,9 @@ def test_what_lies_still_is_back_when_the_camera_is(with_scene):
 
 
 def test_the_camera_is_located_often_until_points_confirm_a_return(monkeypatch):
-    located, locate = [], Scene.locate
+    located, locate = [], CameraTracker.locate
     monkeypatch.setattr(
-        Scene, "locate", lambda self, frame, *more: located.append(frame.index) or locate(self, frame, *more)
+        CameraTracker, "locate", lambda self, frame, *more: located.append(frame.index) or locate(self, frame, *more)
     )
     method, back = Point2Pose(CAMERA), []
     for k, x_m in enumerate([*np.arange(0, 0.6, 0.03), *np.arange(0.57, -0.01, -0.03)]):

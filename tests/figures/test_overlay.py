@@ -8,11 +8,11 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.overlay import EDGES, Box, Label
+from p2p_lib.figures.overlay import EDGES, Label, OrientedBox
 
 CAMERA = Camera(615.0, 590.0, 321.3, 236.8, 640, 480)
 SIZE = np.array([0.10, 0.06, 0.15])
-BOX = Box(np.eye(4), SIZE)
+BOX = OrientedBox(np.eye(4), SIZE)
 
 
 def picture(value=90):
@@ -78,7 +78,7 @@ def test_lines_are_cut_off_in_front_of_the_camera():
     assert np.allclose(a, CAMERA.project(line[0, 0]))
     assert np.allclose(b, CAMERA.project(line[0, 0] + share * (line[0, 1] - line[0, 0])))
     assert len(overlay._segments(CAMERA, line - [0, 0, 2.0])) == 0
-    around_the_camera = overlay.draw_box(picture(), CAMERA, np.eye(4), Box(np.eye(4), np.ones(3)), "#FFFFFF")
+    around_the_camera = overlay.draw_box(picture(), CAMERA, np.eye(4), OrientedBox(np.eye(4), np.ones(3)), "#FFFFFF")
     assert around_the_camera.shape == (480, 640, 3)
 
 
@@ -227,10 +227,12 @@ def test_box_around_points():
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.1, 0, 0.2], [0.3, 0.1, 0.25], (4000, 3))
     T = random_pose(5)
-    box = Box.around(points, T)
+    box = OrientedBox.around(points, T)
     inner = se3.transform(se3.inverse(box.T_obj_box), se3.transform(T, points))
     assert np.allclose(np.abs(inner).max(0), box.size_m / 2, atol=1e-12)
     assert np.allclose(box.size_m, [0.4, 0.1, 0.05], rtol=0.01)
-    assert np.allclose(Box.around([*points, [np.nan, 0, 0]]).size_m, box.size_m), "what is not finite is left out"
+    assert np.allclose(OrientedBox.around([*points, [np.nan, 0, 0]]).size_m, box.size_m), (
+        "what is not finite is left out"
+    )
     with pytest.raises(BadInput, match="no finite points"):
-        Box.around(np.full((3, 3), np.nan))
+        OrientedBox.around(np.full((3, 3), np.nan))

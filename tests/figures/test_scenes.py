@@ -13,7 +13,7 @@ from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
-from p2p_lib.figures.overlay import Box
+from p2p_lib.figures.overlay import OrientedBox
 from p2p_lib.figures.playback import Playback
 from p2p_lib.figures.plots import gaps
 from p2p_lib.figures.scenes import Scene, draw_live, side_by_side
@@ -35,9 +35,9 @@ def in_colour(image, colour, uv_px):
 
 def box_edges(made, name, row):
     """Pixels along the front edges of the model's box at the truth."""
-    obj, box = made.run.objects[name], Box.around(made.run.points[name])
+    obj, box = made.run.objects[name], OrientedBox.around(made.run.points[name])
     T = obj.T_cam_model[row] @ box.T_obj_box
-    ends = Box(np.eye(4), box.size_m).corners(np.eye(4))[overlay.EDGES[overlay._front_edges(T, box.size_m)]]
+    ends = OrientedBox(np.eye(4), box.size_m).corners(np.eye(4))[overlay.EDGES[overlay._front_edges(T, box.size_m)]]
     along = ends[:, 0, None] + np.linspace(0.1, 0.9, 9)[:, None] * (ends[:, 1] - ends[:, 0])[:, None]
     return made.sequence.camera.project(se3.transform(T, along.reshape(-1, 3)))
 
@@ -94,7 +94,7 @@ def test_without_evaluation_there_are_axes_and_the_boxes_given(made):
     uv = box_edges(made, "can", 0)
     assert in_colour(bare.draw(0), bare.colours["can"], uv) < 0.2
     assert (bare.draw(0) != made.sequence.frame(0).rgb).any()
-    given = Box.around(made.run.points["can"], made.evaluation.objects["can"].T_obj_model)
+    given = OrientedBox.around(made.run.points["can"], made.evaluation.objects["can"].T_obj_model)
     boxed = Scene(made.sequence, made.run, truth=False, boxes={"can": given})
     assert in_colour(boxed.draw(0, axes=False), boxed.colours["can"], uv) > 0.8
 
@@ -155,7 +155,7 @@ def test_every_map_is_drawn_and_the_surface_only_where_it_is_of_that_map(made, t
             T, frame = truth[i] @ se3.inverse(T_map_model[k]), made.sequence.frame(i)
             estimate = PoseEstimate("box", i, frame.time_s, Status.TRACKED, T, 0.9, keyframe=i % 8 == 0, map_id=k)
             writer.add(frame, {"box": estimate}, 5)
-    box = Box.around(points, T_map_model[1])
+    box = OrientedBox.around(points, T_map_model[1])
     surface = trimesh.creation.box(box.size_m, box.T_obj_box)
     surface.visual.vertex_colors = np.tile([200, 40, 40, 255], (len(surface.vertices), 1))
     (tmp_path / "run/meshes").mkdir()

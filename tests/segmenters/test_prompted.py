@@ -17,7 +17,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin import prompted
 from p2p_lib.segmenters.builtin import segmenter as built_in
 from p2p_lib.segmenters.builtin.patch import Box, Patch
-from p2p_lib.segmenters.builtin.prompted import NO_PX, Cut, Cutter, _measured
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cut, Cutter, Effect, _measured
 from p2p_lib.segmenters.builtin.segmenter import BuiltinSegmenter
 from p2p_lib.segmenters.builtin.start_doubts import doubt_prompt
 from p2p_lib.segmenters.builtin.start_evidence import Clicked
@@ -148,7 +148,9 @@ def test_where_two_cuts_are_as_good_a_click_is_asked_for(monkeypatch, doubtful, 
     prompt = Prompt("left", points_px=[[110, 100]])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        doubt_prompt(Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others, False)
+        doubt_prompt(
+            Cutter(picture(), CAMERA, preset().segmentation, prompt, np.zeros((0, 2))), mask, others, Effect.BEGUN
+        )
     assert bool(caught) == said
     if said:
         text = r"3600 pixels selected; a mask of 6600 fits as well. If pixel \((\d+), (\d+)\)"
@@ -172,7 +174,7 @@ def test_a_click_on_another_thing_is_named(clicks, named):
     cutter = Cutter(frame, CAMERA, preset().segmentation, Prompt("left", points_px=clicks), np.zeros((0, 2)))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        doubt_prompt(cutter, LEFT | RIGHT if named else LEFT, {}, True)
+        doubt_prompt(cutter, LEFT | RIGHT if named else LEFT, {}, Effect.BEGUN_ELSEWHERE)
     said = [re.search(r"alone, the click at \((\d+), (\d+)\) selects something else", str(w.message)) for w in caught]
     assert [tuple(map(int, found.groups())) for found in said if found] == ([named] if named else [])
 
@@ -478,16 +480,16 @@ def test_what_selects_nothing_leaves_an_object_its_mask(say):
 
 def test_doubts_are_of_the_newest_prompts(monkeypatch):
     """Whether one began a mask, or mended it, and whether that was far from another."""
-    monkeypatch.setattr(built_in, "doubt_prompt", lambda cutter, mask, others, elsewhere: f"{elsewhere}")
+    monkeypatch.setattr(built_in, "doubt_prompt", lambda cutter, mask, others, effect: effect)
     cutter = segmenter()
     cutter.segment(picture(), [Prompt("left", points_px=[[120, 110]])])
-    assert cutter.doubts == {"left": "False"}
+    assert cutter.doubts == {"left": "begun"}
     cutter.segment(picture(1), [Prompt("left", points_px=[[121, 111]]), Prompt("right", points_px=[[174, 109]])])
-    assert cutter.doubts == {"left": "None", "right": "False"}
+    assert cutter.doubts == {"left": "mended", "right": "begun"}
     cutter.segment(picture(2))
     assert cutter.doubts == {}
     cutter.segment(picture(3), [Prompt("left", points_px=[[40, 35]])])
-    assert cutter.doubts == {"left": "True"}, "far from what it was followed by"
+    assert cutter.doubts == {"left": "begun elsewhere"}, "far from what it was followed by"
 
 
 @pytest.mark.parametrize(
@@ -510,6 +512,6 @@ def test_a_correction_that_starts_anew_is_doubted(was, say, said):
 
 def test_a_click_that_the_mask_goes_against_all_the_same_is_named(recwarn):
     cutter = SimpleNamespace(prompt=Prompt("left", 1, [[110, 100], [40, 35]], [[100, 90]]), frame=picture(1))
-    assert "(40, 35) is outside its mask all the same" in doubt_prompt(cutter, LEFT, {}, None)
+    assert "(40, 35) is outside its mask all the same" in doubt_prompt(cutter, LEFT, {}, Effect.MENDED)
     cutter.prompt = Prompt("left", 1, [[110, 100]], [[100, 90]])
-    assert "(100, 90) is inside its mask all the same" in doubt_prompt(cutter, LEFT, {}, None)
+    assert "(100, 90) is inside its mask all the same" in doubt_prompt(cutter, LEFT, {}, Effect.MENDED)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from p2p_lib.datasets.sequence import open_sequence
-from p2p_lib.evaluation.point_tracks import Outcome
 from p2p_lib.evaluation.tracker_score import TrackTask
 from p2p_lib.figures import overlay, style
 from studies import tracking2d as tracks
+from studies.tracking2d import QueryOutcome
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +25,8 @@ def scores(task):
 
 def test_a_perfect_tracker_is_right_or_rightly_silent(scores):
     came = tracks.score_outcomes(scores["perfect"])
-    assert set(np.unique(came)) == {Outcome.NOT_ASKED, Outcome.HIDDEN, Outcome.RIGHT}
-    assert ((came == Outcome.RIGHT) <= scores["perfect"].truth.visible).all()
+    assert set(np.unique(came)) == {QueryOutcome.NOT_ASKED, QueryOutcome.HIDDEN, QueryOutcome.RIGHT}
+    assert ((came == QueryOutcome.RIGHT) <= scores["perfect"].truth.visible).all()
 
 
 def test_a_tracker_that_did_not_run_has_dashes_and_a_reason(scores):
@@ -74,3 +74,25 @@ def test_time_plots_take_what_ran_and_leave_out_what_did_not(task, scores):
     assert line.get_label() == "perfect" and (share[np.isfinite(share)] == 100).all()
     bands = tracks.outcome_bands({"perfect": scores["perfect"]}, task.sequence.times_s)
     assert bands.axes[0].get_images()[0].get_array().shape == (24, 300)
+
+
+def test_every_outcome_by_hand():
+    uv_true = np.zeros((1, 6, 2))
+    uv = np.array([[[7.9, 0], [8.1, 0], [0, 0], [0, 0], [np.nan, np.nan], [0, 0]]])
+    truly = np.array([[True, True, True, False, False, True]])
+    said = np.array([[True, True, False, True, False, True]])
+    asked = np.array([[True, True, True, True, True, False]])
+    names = [QueryOutcome(k).name for k in tracks.outcomes(uv_true, truly, uv, said, asked)[0]]
+    assert names == ["RIGHT", "WRONG", "MISSED", "WRONG", "HIDDEN", "NOT_ASKED"]
+
+
+def test_reliability_of_an_honest_and_of_a_blind_tracker():
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(1, 6, 20_000)
+    error = np.abs(sigma * rng.normal(size=sigma.shape))
+    honest, blind = tracks.reliability(error, sigma), tracks.reliability(error, rng.uniform(size=sigma.shape))
+    assert len(honest.uncertainty) == 10
+    np.testing.assert_allclose(honest.median_px, 0.6745 * honest.uncertainty, rtol=0.1)
+    np.testing.assert_allclose(honest.p90_px, 1.645 * honest.uncertainty, rtol=0.15)
+    assert honest.rank_correlation > 0.4 > 0.03 > abs(blind.rank_correlation)
+    assert np.ptp(blind.median_px) < 0.3

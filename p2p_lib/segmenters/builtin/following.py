@@ -27,7 +27,7 @@ _WIDER, _WAS_BESIDE = 1.6, 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class FlowPrediction:
     """An object's mask of a frame ago, moved by the optical flow: on a patch of this frame, its probability (h, w).
 
     jumped    (h, w) bool: its depth changed, so that something else has come before it or it has gone
@@ -51,7 +51,7 @@ class Prediction:
         return self.patch.box, self.patch.up(self.prior)
 
 
-def predict(view: View, target: Target, wider: float = 1.0) -> Prediction:
+def predict(view: View, target: Target, wider: float = 1.0) -> FlowPrediction:
     """Move the mask of an object that was seen a frame ago by the optical flow, on a patch so many times as wide."""
     frame, cfg, seen = view.frame, view.config, target.seen
     assert seen is not None and target.size_m is not None and view.previous is not None  # a frame ago
@@ -72,7 +72,7 @@ def predict(view: View, target: Target, wider: float = 1.0) -> Prediction:
     changed = abs(area - np.count_nonzero(was > 0.5)) > _MAX_AREA_CHANGE * area
     doubtful = changed or np.count_nonzero(jumped) > _MAX_JUMPED * area or blind > _MAX_UNMEASURED * area
     left = np.count_nonzero(jumped & (patch.depth_m > z_before)) > area / 2
-    return Prediction(patch, prior, jumped, shown, beside, bool(left), bool(doubtful))
+    return FlowPrediction(patch, prior, jumped, shown, beside, bool(left), bool(doubtful))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class Evidence:
     beyond   whether what depth connects with it goes on beyond the patch
     """
 
-    predicted: Prediction
+    predicted: FlowPrediction
     geometry: np.ndarray
     surface: np.ndarray
     component: np.ndarray
@@ -93,7 +93,7 @@ class Evidence:
     beyond: bool
 
     @classmethod
-    def of(cls, view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: Prediction) -> Evidence:
+    def of(cls, view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: FlowPrediction) -> Evidence:
         """Around a predicted mask."""
         cfg, patch, prior = view.config, predicted.patch, predicted.prior
         assert target.seen is not None  # a frame ago
@@ -120,7 +120,7 @@ class Evidence:
         return bool(self.component.any() and not was_beside)
 
 
-def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: Prediction) -> Claim:
+def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: FlowPrediction) -> Claim:
     """Cut the object out around its predicted mask.
 
     A side that turns into view may reach beyond the patch, which has room for what has been seen. None if the object

@@ -6,6 +6,7 @@ A prompt starts an object, or corrects its mask.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -66,6 +67,14 @@ _SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
 _HOLE_PX, _ONE_SURFACE_M = 3, 0.02
 #: A click on something else claims the cells of the grid within this radius.
 _AROUND_PX = 3
+
+
+class Effect(StrEnum):
+    """What a prompt does to its object's mask: mends it, or begins one, perhaps far from another."""
+
+    MENDED = "mended"
+    BEGUN = "begun"
+    BEGUN_ELSEWHERE = "begun elsewhere"
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +194,14 @@ class Cutter:
         either = np.prod(high - low) + np.prod(last - first) - both
         return float(_PER_UNFILLED * max(_FILLED - both / either, 0))
 
-    def leaves(self, was: np.ndarray) -> bool:
+    def effect(self, was: np.ndarray) -> Effect:
+        """On a mask (H, W) bool; negative clicks alone, which cannot begin one, mend an empty one, too."""
+        if was.any() and self._leaves(was):
+            return Effect.BEGUN_ELSEWHERE
+        mends = was.any() and self.prompt.box_px is None
+        return Effect.MENDED if mends or not self.prompt.starts else Effect.BEGUN
+
+    def _leaves(self, was: np.ndarray) -> bool:
         """Whether a mask (H, W) bool is farther from every positive click than it is long: it is of something else."""
         clicks, ends = self.prompt.points_px, ends_px(was)
         away = np.maximum(np.maximum(ends[0] - clicks, clicks - ends[1] + 1), 0)

@@ -11,9 +11,9 @@ This module is the order of the stages in a frame; the package's docstring says 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,37 +24,21 @@ from p2p_lib.core.prompts import Prompt, check_depth, check_prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.bystanders import with_bystanders
 from p2p_lib.segmenters.builtin.finding import find, near_last
-from p2p_lib.segmenters.builtin.following import Prediction, follow, holds, predict, with_room
+from p2p_lib.segmenters.builtin.following import FlowPrediction, follow, holds, predict, with_room
 from p2p_lib.segmenters.builtin.patch import Box
-from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, Effect
 from p2p_lib.segmenters.builtin.start_doubts import doubt_nothing, doubt_prompt
 from p2p_lib.segmenters.builtin.target import Target, seen_in
 from p2p_lib.segmenters.builtin.view import Claim, View
+
+if TYPE_CHECKING:
+    from p2p_lib.segmenters.sam2 import Sam2Refiner
 
 #: An object with a confident pose is cut out in every third frame, in turns, and moved by the optical flow in between.
 _TURNS = 3
 _NO_HINT = Hint()
 #: Objects are beside each other whose boxes are so near, px.
 _BESIDE_PX = 12
-
-
-class Refiner(Protocol):
-    """Replaces masks of :class:`BuiltinSegmenter`, see :class:`p2p_lib.segmenters.sam2.Sam2Refiner`."""
-
-    name: str
-
-    def refine(
-        self,
-        frame: Frame,
-        prompts: Mapping[str, Prompt],
-        found: Mapping[str, np.ndarray],
-        hints: Mapping[str, Hint],
-        corrected: Collection[str] = (),
-    ) -> dict[str, np.ndarray]:
-        """Better masks (H, W) bool of some of the objects ``found`` in this frame; the others keep theirs.
-
-        corrected  the objects whose masks the prompts correct
-        """
 
 
 class BuiltinSegmenter:
@@ -64,15 +48,14 @@ class BuiltinSegmenter:
     doubts   of objects that a prompt of the newest frame has started or corrected: what is doubtful about their masks
     """
 
-    def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Refiner | None = None):
+    def __init__(self, camera: Camera, config: SegmentationConfig, refiner: Sam2Refiner | None = None):
         self.name = "builtin" if refiner is None else refiner.name
         self.camera, self.config, self._refiner = camera, config, refiner
         self._targets: dict[str, Target] = {}
         self._previous: Frame | None = None
         self._frames = 0
         self.doubts: dict[str, str] = {}
-        # Whose masks prompts of the newest frame did not mend, but began; and whether it had another one elsewhere.
-        self._begun: dict[str, bool] = {}
+        self._effects: dict[str, Effect] = {}  # of the newest frame's prompts on their objects' masks
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,12 +79,7 @@ class BuiltinSegmenter:
         self._frames += 1
         view = View(frame, self._previous, self.camera, self.config)
         cutters = {name: _cutter(view, prompt, prompt_of) for name, prompt in prompt_of.items() if prompt.mask is None}
-        self.doubts, self._begun = {}, {}
-        corrected = [
-            name
-            for name, cutter in cutters.items()
-            if cutter.prompt.box_px is None and self._targets.get(name, Target()).in_view
-        ]
+        self.doubts, self._effects = {}, {}
         masks = {name: prompt.mask for name, prompt in prompt_of.items() if prompt.mask is not None}
         due, claims = self._due(), {}
         taken = np.logical_or.reduce([np.zeros(frame.shape, bool), *masks.values()])
@@ -112,7 +90,7 @@ class BuiltinSegmenter:
                 asked = cutters.get(name), hints, taken, name in due
                 self._targets[name], claims[name] = self._locate(view, name, *asked)
                 _mark(taken, claims[name])
-        claims |= self._refined(frame, prompt_of, claims, hints, corrected)
+        claims |= self._refined(frame, prompt_of, claims, hints)
         labels = self._assign(view, claims)
         _label_given(labels, self.names, masks)
         self.doubts |= self._doubts(labels, cutters)
@@ -179,13 +157,10 @@ class BuiltinSegmenter:
             had = self._follow(view, cutter.prompt.name, target, hints, taken, due)
         was = np.zeros(view.frame.shape, bool)
         _mark(was, had[1])
+        self._effects[cutter.prompt.name] = effect = cutter.effect(was)
         if not cutter.prompt.starts:
             return Target(), cutter.correct(was) if was.any() else None
-        leaves = was.any() and cutter.leaves(was)
-        mends = was.any() and not leaves and cutter.prompt.box_px is None
-        if not mends:
-            self._begun[cutter.prompt.name] = bool(leaves)
-        box, x = cutter.correct(was) if mends else cutter.start()
+        box, x = cutter.correct(was) if effect is Effect.MENDED else cutter.start()
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             self.doubts[cutter.prompt.name] = doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
@@ -198,7 +173,7 @@ class BuiltinSegmenter:
         target: Target,
         hints: Mapping[str, Hint],
         taken: np.ndarray,
-        predicted: Prediction | None,
+        predicted: FlowPrediction | None,
     ) -> tuple[Target, Claim]:
         """Follow an object that was seen a frame ago, else find it outside what is ``taken`` (H, W) bool."""
         hint = hints.get(name, _NO_HINT)
@@ -233,7 +208,6 @@ class BuiltinSegmenter:
         prompt_of: Mapping[str, Prompt],
         claims: Mapping[str, Claim],
         hints: Mapping[str, Hint],
-        corrected: Collection[str],
     ) -> dict[str, Claim]:
         """The refiner's claims, of the objects whose masks it replaces."""
         if self._refiner is None:
@@ -242,7 +216,8 @@ class BuiltinSegmenter:
         for name, claim in claims.items():
             _mark(masks[name], claim)
         prompts = {name: prompt for name, prompt in prompt_of.items() if prompt.mask is None}
-        refined, whole = self._refiner.refine(frame, prompts, masks, hints, corrected), Box(0, 0, *frame.shape[::-1])
+        mended = [name for name, effect in self._effects.items() if effect is Effect.MENDED]
+        refined, whole = self._refiner.refine(frame, prompts, masks, hints, mended), Box(0, 0, *frame.shape[::-1])
         return {name: (whole, mask.astype(np.float32)) for name, mask in refined.items()}
 
     @staticmethod
@@ -283,7 +258,7 @@ class BuiltinSegmenter:
             if name in self.doubts:  # it has selected nothing: the mask is not of it
                 continue
             others = {other: mask for other, mask in masks.items() if other != name}
-            said[name] = doubt_prompt(cutter, masks[name], others, self._begun.get(name))
+            said[name] = doubt_prompt(cutter, masks[name], others, self._effects[name])
         return {name: text for name, text in said.items() if text}
 
 

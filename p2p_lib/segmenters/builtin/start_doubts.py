@@ -12,7 +12,7 @@ from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import doubt
 from p2p_lib.core.image import ends_px, in_mask
 from p2p_lib.segmenters.builtin.patch import Patch, around, dilated, plane_heights, support_plane
-from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter
+from p2p_lib.segmenters.builtin.prompted import NO_PX, Cutter, Effect
 
 #: An object is flat if its median height over the plane around it is less than this, in standard deviations of depth.
 _FLAT = 2.0
@@ -25,18 +25,18 @@ _FEW = 10
 _AS_GOOD, _OTHER_SIZE, _SAME = 1.2, 1.5, 0.7
 
 
-def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], elsewhere: bool | None) -> str:
+def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarray], effect: Effect) -> str:
     """Warn if a prompt has selected nothing, or something else than its object, or has not mended its mask.
 
     Returns the warning; empty where nothing is doubtful.
 
-    cutter     the one that cut it out, with a mask (H, W) bool
-    others     the other objects' masks (H, W) bool in this frame
-    elsewhere  of a mask that it began, whether its object had another one far from the clicks; None where it mended it
+    cutter  the one that cut it out, with a mask (H, W) bool
+    others  the other objects' masks (H, W) bool in this frame
+    effect  of the prompt on that mask
     """
     if not mask.any():
         return doubt_nothing(cutter)
-    if elsewhere is None:
+    if effect is Effect.MENDED:
         return _not_mended(cutter, mask)
     frame, who = cutter.frame, _who(cutter)
     corners = ends_px(mask)
@@ -57,7 +57,7 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
         got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
         fix = f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it."
         return doubt(who, got, fix)
-    if elsewhere:
+    if effect is Effect.BEGUN_ELSEWHERE:
         return doubt(who, "they are farther from its mask than that is long", "It starts anew there.")
     return ""
 

@@ -58,11 +58,6 @@ class Target:
     bystanders: Bystanders | None = None
     given: tuple[Frame, np.ndarray] | None = None
 
-    @property
-    def in_view(self) -> bool:
-        """Whether it had a mask a frame ago."""
-        return self.seen is not None or self.given is not None
-
     def with_given(self, frame: Frame, mask: np.ndarray) -> Target:
         """With a mask (H, W) bool that was given: an empty one says that the object is hidden."""
         return replace(self, seen=None, given=(frame, mask) if mask.any() else self.given)

@@ -16,7 +16,7 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.robust import consensus
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
-from p2p_lib.trackers.builtin.rigid_motion import PoseFit, Prediction, fit_pose, pose_distance_m, predict
+from p2p_lib.trackers.builtin.rigid_motion import PointPrediction, PoseFit, fit_pose, pose_distance_m, predict
 from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at
 from p2p_lib.trackers.builtin.tracked_points import Points
 from p2p_lib.trackers.builtin.wide_baseline import Matched, SegmentView, corners_of, matched
@@ -93,7 +93,7 @@ class MotionSegments:
         """(N,) points on segments that corners of the frame before show in the newest one."""
         return np.array([segment.matched is not None for segment in self.segments] + [False])[p.segment]
 
-    def predict(self, p: Points, rows: np.ndarray, now: Image) -> Prediction:
+    def predict(self, p: Points, rows: np.ndarray, now: Image) -> PointPrediction:
         """Where these points of segments are by their segments' poses."""
         of, fits = p.segment[rows], [segment.fit for segment in self.segments]
         covariance, centre = np.stack([f.covariance for f in fits])[of], np.stack([f.centre for f in fits])[of]

@@ -128,7 +128,7 @@ def _rotation(w: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class PointPrediction:
     """Where points of posed segments are predicted.
 
     uv_px  (N, 2), warp (N, 2, 2), cov_px2 (N, 2, 2); z_m (N,); cosine (N,) of surface normal and view
@@ -154,7 +154,7 @@ def predict(
     map_cov: np.ndarray,
     tangent: np.ndarray,
     camera: Camera,
-) -> Prediction:
+) -> PointPrediction:
     """Of points (N, 3) on segments at T (N, 4, 4), covariance (N, 6, 6), centre (N, 3) as in PoseFit."""
     R = T[:, :3, :3]
     p_cam = (R @ p_seg[..., None])[..., 0] + T[:, :3, 3]
@@ -167,7 +167,7 @@ def predict(
     normal = np.cross(across[..., 0], across[..., 1])
     length = np.linalg.norm(normal, axis=1) * np.linalg.norm(p_cam, axis=1)
     cosine = (normal * p_cam).sum(1) / np.maximum(length, 1e-12)
-    return Prediction(uv, P @ across, cov, p_cam[:, 2], cosine)
+    return PointPrediction(uv, P @ across, cov, p_cam[:, 2], cosine)
 
 
 def pose_distance_m(T_a: np.ndarray, T_b: np.ndarray, centre: np.ndarray) -> float:

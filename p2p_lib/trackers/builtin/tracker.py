@@ -10,7 +10,7 @@ from p2p_lib.core.types import Frame, Tracks, joined
 from p2p_lib.trackers.builtin import recognition
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.motion_segments import MIN_FOUND, MIN_SUGGESTED, MotionSegments
-from p2p_lib.trackers.builtin.rigid_motion import Prediction
+from p2p_lib.trackers.builtin.rigid_motion import PointPrediction
 from p2p_lib.trackers.builtin.tracked_points import Points
 from p2p_lib.trackers.ids import PointIds
 
@@ -121,7 +121,7 @@ class BuiltinTracker:
         uncertainty = np.where(p.visible, sigma_px / (sigma_px + self.config.uncertain_px), 1.0)
         return Tracks(self._ids.live.copy(), p.uv.astype(float), p.visible.copy(), uncertainty.astype(float))
 
-    def _exposed(self, predicted: Prediction, search: np.ndarray | None) -> np.ndarray:
+    def _exposed(self, predicted: PointPrediction, search: np.ndarray | None) -> np.ndarray:
         """Whether predicted points face the camera, with their own surface or no depth measured at their pixels."""
         z = self._now.depth_at(predicted.uv_px)
         own = (z == 0) | (np.abs(z - predicted.z_m) <= self.config.depth_jump_m)
