@@ -13,6 +13,7 @@ import time
 import warnings
 from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -23,7 +24,7 @@ import pytest
 import trimesh
 
 from p2p_lib.apps import cli
-from p2p_lib.apps.live import _warm_up, json_line, text_line, track_live
+from p2p_lib.apps.live import _filmed, _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import KEPT, Words, outlet
 from p2p_lib.core.camera import Camera
@@ -304,6 +305,20 @@ def test_a_run_is_kept_and_filmed(folder, tmp_path):
     for film in ("film.mp4", "again.mp4"):
         with av.open(str(tmp_path / film)) as container:
             assert sum(1 for _ in container.decode(video=0)) == count.frames
+
+
+def test_each_object_keeps_its_colour_in_the_film():
+    """Whichever were removed before, and also once it is added again."""
+    masks = {name: np.zeros((H, W), bool) for name in ("mug", "tin")}
+    masks["mug"][40:60, 10:30] = masks["tin"][40:60, 50:70] = True
+    method, film = SimpleNamespace(objects=masks, masks=masks), []
+    listen = _filmed(SimpleNamespace(add=lambda image, time_s: film.append(image)), "camera", method, None)
+    for k, followed in enumerate((["mug", "tin"], ["tin"], ["tin", "mug"])):
+        method.objects = method.masks = {name: masks[name] for name in followed}
+        listen(picture(k), {})
+    both, alone, again = film
+    assert (alone[masks["tin"]] == both[masks["tin"]]).all() and (again[40:] == both[40:]).all()
+    assert (alone[masks["mug"]] == 0).all() and (both[50, 20] != both[50, 60]).any()
 
 
 def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):
