@@ -12,6 +12,7 @@ import threading
 import time
 import warnings
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.error import HTTPError
@@ -39,12 +40,14 @@ from p2p_lib.datasets import cameras, run_writer
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import run_lengths, save_prompts
+from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.consistency import consistency
 from p2p_lib.evaluation.known_size import Watch
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
+from p2p_lib.keeper import Keeper
 from p2p_lib.run import run
 from p2p_lib.trackers.lk import LkTracker
 from tests.apps.test_cli import POINTS_ALONE
@@ -319,6 +322,22 @@ def test_each_object_keeps_its_colour_in_the_film():
     both, alone, again = film
     assert (alone[masks["tin"]] == both[masks["tin"]]).all() and (again[40:] == both[40:]).all()
     assert (alone[masks["mug"]] == 0).all() and (both[50, 20] != both[50, 60]).any()
+
+
+def test_an_object_that_is_added_again_before_the_next_frame_is_a_new_one(folder, tmp_path):
+    """And no correction of the one that had its name."""
+    sequence, said = open_sequence(folder), list(PROMPTS)
+    method = Point2Pose(sequence.camera, preset("default").with_values(SETTINGS))
+    with RunWriter(tmp_path / "run", sequence, method.config, "builtin", "clicks") as writer:
+        keeper, drawn = Keeper(writer, method, prompts=said), []
+        for k in range(4):
+            if k == 2:
+                method.remove_object("board")
+            if k in (0, 2, 3):
+                said.append(replace(PROMPTS[0], frame=k))
+                method.tell(said[-1])
+            drawn.append(keeper.add(sequence.frame(k), method.step(sequence.frame(k))))
+    assert drawn == [(["board"], []), ([], []), (["board"], []), ([], ["board"])]
 
 
 def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):
