@@ -324,8 +324,9 @@ def test_each_object_keeps_its_colour_in_the_film():
     assert (alone[masks["mug"]] == 0).all() and (both[50, 20] != both[50, 60]).any()
 
 
-def test_an_object_that_is_added_again_before_the_next_frame_is_a_new_one(folder, tmp_path):
+def test_an_object_that_is_added_again_before_the_next_frame_is_a_new_one(folder, tmp_path, caplog):
     """And no correction of the one that had its name."""
+    caplog.set_level("INFO", "p2p_lib")
     sequence, said = open_sequence(folder), list(PROMPTS)
     method = Point2Pose(sequence.camera, preset("default").with_values(SETTINGS))
     with RunWriter(tmp_path / "run", sequence, method.config, "builtin", "clicks") as writer:
@@ -338,6 +339,9 @@ def test_an_object_that_is_added_again_before_the_next_frame_is_a_new_one(folder
                 method.tell(said[-1])
             drawn.append(keeper.add(sequence.frame(k), method.step(sequence.frame(k))))
     assert drawn == [(["board"], []), ([], []), (["board"], []), ([], ["board"])]
+    turns = [text for text in caplog.messages if re.search("begins|removed|corrected", text)]
+    first, second = ("frame 0: board begins, is tracked", "frame 2: board begins, is tracked")
+    assert turns == [first, "board is removed", second, "frame 3: board is corrected"]
 
 
 def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):
