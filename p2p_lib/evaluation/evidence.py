@@ -118,9 +118,10 @@ def gathered(
         of_points = _of_keypoints(obj, keypoints, masks, sequence.camera)
     elsewhere = every.has_pose & ~obj.has_pose
     of_poses = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
-    of_surface = fit.overlap, fit.through, fit.on_surface
+    seen, inside, off_px, jump_px = of_points
+    compared = seen, inside, off_px, jump_px, fit.overlap, fit.through, fit.on_surface
     far = np.isin(obj.frame_index, list(moved))
-    return RunEvidence(*of_poses, px, size_m, cut, *of_points, *of_surface, far, doubts, apart, offline)
+    return RunEvidence(*of_poses, px, size_m, cut, *compared, far, doubts, apart, offline)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:
