@@ -64,10 +64,11 @@ class Keeper:
 
     def add(self, frame: Frame, estimates: Mapping[str, PoseEstimate]) -> tuple[list[str], list[str]]:
         """The frame that has just been estimated; of which objects the first mask in it is drawn, a corrected one."""
-        method = self.method
+        method, anew = self.method, list[str]()
         for name, obj in method.objects.items():
             if obj not in (trackers := self.followed.setdefault(name, [])):
                 trackers.append(obj)
+                anew.append(name)
             seen = method.tracks.visible & np.isin(method.tracks.ids, obj.model.map.ids)
             self.keypoints.add(frame.index, name, method.tracks.ids[seen], method.tracks.uv_px[seen])
         stages_ms = dict(method.stopwatch.last_ms)
@@ -77,7 +78,7 @@ class Keeper:
         for name, mask in method.masks.items():
             if mask is not None:
                 self.mask_log.add(frame, name, mask)
-        return self.first_masks.add(frame, method.masks)
+        return self.first_masks.add(frame, method.masks, anew)
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""

@@ -24,7 +24,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, Doubt
 from p2p_lib.core.memory import save_memory
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
@@ -239,6 +239,42 @@ def test_services_add_correct_and_remove(tmp_path):
     for k in range(3, 9):
         node.on_images(*images(k))
     assert got[-1].object == "card" and got[-1].T_cam_obj is not None, "found without a click"
+
+
+def test_clicks_belong_to_the_image_whose_stamp_they_have():
+    """A card that moves: what was clicked on is found where it was, and a correction of it holds no longer."""
+    got: list[PoseEstimate] = []
+    node = nodes.TrackingNode(RunOptions(), lambda estimate, header: got.append(estimate))
+    node.on_images(*images(0))
+    stamp = images(0)[0].header.stamp
+    assert node.add(request("AddObject", "card", CARD.points_px, stamp=stamp), answer()).success
+    node.on_images(*images(0))
+    assert got[-1].T_cam_obj is not None, "nothing has moved since"
+    moved = request("CorrectObject", "card", CARD.points_px, stamp=stamp)
+    assert node.correct(moved, answer("CorrectObject")).success
+    with pytest.warns(Doubt, match="moved"):
+        node.on_images(*images(9))
+    assert "moved" in got[-1].reason
+    moved.stamp.nanosec += 1
+    late = node.correct(moved, answer("CorrectObject"))
+    assert not late.success and "one of the last 60 images that were tracked" in late.message
+
+
+def test_an_image_of_another_size_is_left_out():
+    """Until so many come that the camera is another one."""
+    got: list[PoseEstimate] = []
+    node = nodes.TrackingNode(RunOptions(prompts=[CARD]), lambda estimate, header: got.append(estimate))
+    rgb, depth, info = images(1)
+    small = image(np.zeros((60, 80, 3), np.uint8), "rgb8"), image(np.zeros((60, 80), np.uint16), "16UC1"), info
+    node.on_images(*images(0))
+    node.on_images(*small)
+    node.on_images(image(np.zeros((60, 80, 3), np.uint8), "rgb8"), depth, info)
+    with pytest.warns(Doubt, match="80x60, not 320x240 .* It is left out") as said:
+        node.on_images(rgb, depth, info)
+    assert len(got) == 2 and sum("left out" in str(of.message) for of in said) == 2
+    with pytest.raises(BadInput, match="30 in a row were"):
+        for _ in range(30):
+            node.on_images(*small)
 
 
 def test_parameters_are_options_of_a_run():

@@ -39,6 +39,7 @@ from p2p_lib.datasets.depth_units import (
     distance_m,
     hardly_counts,
     likely_units,
+    odd_scene,
     odd_size,
     uncounted,
 )
@@ -369,8 +370,11 @@ def _depth(frames: list[Frame], scale: float) -> Finding:
 
 
 def _uncounted(depth: Finding, frames: list[Frame], config: Config, scale: float) -> Finding | None:
-    """The finding on depth where hardly any is at distances that count: without objects, all that tells a unit."""
-    wrong = hardly_counts(frames, config.depth, scale)
+    """The finding on depth of which hardly any counts, or whose near part is nowhere near: all that tells a unit here.
+
+    Of masks, what they hold tells more.
+    """
+    wrong = hardly_counts(frames, config.depth, scale) or odd_scene(frames, scale)
     return None if wrong is None else replace(depth, level=Level.LOOK, text=f"{depth.text}, {wrong[0]}", fix=wrong[1])
 
 

@@ -268,11 +268,13 @@ def _warm_up(method: Point2Pose) -> None:
 def _filmed(film: Film, name: str, method: Point2Pose, first: Frame | None) -> Listener:
     """Draws every frame into a film, but for one that was taken before."""
     times_s: list[float] = []
+    names: dict[str, None] = {}  # of all objects so far, by which each keeps its colour
 
     def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:
+        names.update(dict.fromkeys(method.objects))
         if frame is not first:
             times_s.append(frame.time_s)
-            image = draw_live(method, frame, estimates, title=name, start_s=times_s[0])
+            image = draw_live(method, frame, estimates, name, times_s[0], names)
             film.add(image, frame.time_s - times_s[0])
 
     return listen

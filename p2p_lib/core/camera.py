@@ -13,6 +13,8 @@ from p2p_lib.core.image import in_image
 
 #: No camera without distortion has a focal length of a smaller share of its image's width: it sees 157 degrees.
 _WIDEST = 0.1
+#: Nor does any see farther off its axis than that to one side, which holds for each part of its image, too.
+_OFF_AXIS = 0.5 / _WIDEST
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Camera:
             raise BadInput("camera", f"fx, fy, cx, cy = {values}", "finite numbers, focal lengths above 0 (pixels)")
         if self.width < 1 or self.height < 1:
             raise BadInput("camera", f"{self.width}x{self.height}", "an image size of at least 1x1 pixels")
-        _check_pixels("camera", self.fx, self.width)
+        self._check_view()
         for name, value in zip(("fx", "fy", "cx", "cy"), values):
             object.__setattr__(self, name, float(value))
 
@@ -57,8 +59,22 @@ class Camera:
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K - pinhole).max() > 1e-6:
             raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
-        _check_pixels(name, K[0, 0], width)
-        return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
+        try:
+            return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
+        except BadInput as error:
+            raise BadInput(name, error.got, error.expected, error.fix) from None
+
+    def _check_view(self) -> None:
+        """Refuse what no camera sees."""
+        fields = (("x", "columns", self.fx, self.cx, self.width), ("y", "rows", self.fy, self.cy, self.height))
+        for axis, what, f, c, size in fields:
+            if f < _WIDEST * size:
+                fix = "Normalised ones times the width, the height below, are pixels."
+                raise BadInput("camera", f"f{axis} = {f:g} for {size} {what}", "focal lengths in pixels", fix)
+            if (off := max(c + 0.5, size - 0.5 - c) / f) > _OFF_AXIS:
+                got = f"c{axis} = {c:g} for {size} {what}, of which one is {_degrees(off)} degrees off the axis"
+                fix = "Take fx, fy, cx and cy at the images' size; of a part of larger images cx and cy may be outside."
+                raise BadInput("camera", got, f"{_degrees(_OFF_AXIS)} degrees at most", fix)
 
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the same images at another size in pixels."""
@@ -96,8 +112,5 @@ class Camera:
         return in_image(uv_px, (self.height, self.width), margin_px)
 
 
-def _check_pixels(name: str, fx: float, width: int) -> None:
-    """Refuse a focal length as a share of the image's width; ``name`` is what the error calls the camera."""
-    if fx < _WIDEST * width:
-        fix = "Normalised ones times the width, the height below, are pixels."
-        raise BadInput(name, f"fx = {fx:g} for {width} columns", "focal lengths in pixels", fix)
+def _degrees(tangent: float) -> str:
+    return f"{np.degrees(np.arctan(tangent)):.0f}"

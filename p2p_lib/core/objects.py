@@ -20,6 +20,7 @@ from p2p_lib.core.earlier import check_still, selected, with_mask
 from p2p_lib.core.errors import BadInput, did_you_mean, doubt
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
+from p2p_lib.core.journal import Journal
 from p2p_lib.core.prediction import Prediction, Predictor
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_frame, check_prompt, given_masks
 from p2p_lib.core.types import DOUBTED, NOT_FOUND, NOT_SEEN, OUT_OF_VIEW, Frame, PoseEstimate, Status
@@ -47,6 +48,7 @@ class Objects(ABC, Generic[FollowedT]):
 
     objects  what follows each of them, by name
     closed   whether it has been ended
+    journal  tells the logger what becomes of them
     refused  of objects whose last prompt did not fit the frame that it was made on: why it was not used
     """
 
@@ -67,7 +69,7 @@ class Objects(ABC, Generic[FollowedT]):
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._unstarted: dict[str, str] = {}  # objects, and why what was selected of them last did not start them
         self._turn, self.closed = RLock(), False
-        self._predictor = Predictor()
+        self._predictor, self.journal = Predictor(), Journal()
         self._cameras: deque[tuple[float, np.ndarray | None]] = deque()  # time and T_world_cam of frames, as given
 
     @contextmanager
@@ -209,6 +211,7 @@ class Objects(ABC, Generic[FollowedT]):
             for kept in (self._prompts, self._earlier, self.refused, self._without, self._unstarted):
                 kept.pop(name, None)
             self._predictor.forget(name)
+            self.journal.forget(name)
             if name in self.segmenter.names:
                 self.segmenter.remove(name)
 
@@ -248,7 +251,9 @@ class Objects(ABC, Generic[FollowedT]):
             if name in self.segmenter.names:
                 what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
                 self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}")
-        return given, {name: prompt for name, prompt in prompts.items() if name not in refused}
+        taken = {name: prompt for name, prompt in prompts.items() if name not in refused}
+        self.journal.corrected(frame.index, taken.keys() & set(self.segmenter.names))
+        return given, taken
 
     def _carried(self, now: Frame) -> tuple[dict[str, Prompt], dict[str, BadInput], dict[str, str]]:
         """The prompts as they hold in a frame, why others do not, and what is doubtful about the masks made of them.

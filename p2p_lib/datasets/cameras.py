@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, WrongSize, advised, doubt, wrong_size
+from p2p_lib.core.errors import BadInput, P2PError, WrongSize, advised, doubt, wrong_size
 from p2p_lib.core.plugins import check_part, find, is_place
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
@@ -111,6 +111,40 @@ class FolderCamera:
         self._closed.set()
 
 
+class OddImages:
+    """Images of another size than the camera's, which are left out: with a warning once one follows that fits.
+
+    So many in a row, or all that there are, have another camera: :class:`BadInput`.
+    """
+
+    def __init__(self) -> None:
+        self._row: list[WrongSize] = []
+        self._some_fit = False
+
+    def leave_out(self, error: WrongSize) -> None:
+        """One more; raises :class:`BadInput` where it is one too many."""
+        self._row.append(error)
+        if len(self._row) >= _ODD_IN_A_ROW:
+            raise self._refusal()
+
+    def fits(self) -> None:
+        """One that fits: what was left out before it is said."""
+        self._some_fit = True
+        for one in self._row:
+            doubt(one.name, f"{one.got}, not {one.expected}", "It is left out.")
+        self._row.clear()
+
+    def end(self) -> None:
+        """No more come: what was left out is said, and all of them are refused."""
+        if self._row and not self._some_fit:
+            raise self._refusal()
+        self.fits()
+
+    def _refusal(self) -> P2PError:
+        fix = f"{len(self._row)} in a row were: make its camera, a p2p_lib.Camera, that of the images which it gives."
+        return advised(self._row[0], fix)
+
+
 class OwnCamera:
     """Somebody else's camera: what it gives is checked, and it is closed once, however often that is asked for.
 
@@ -120,7 +154,7 @@ class OwnCamera:
 
     def __init__(self, spec: str, own: LiveCamera):
         self._spec, self._own, self._closed, self._last = spec, own, False, -1
-        self._fits = False  # whether any image had the right size
+        self._odd = OddImages()
         check_part("camera", own, {"camera": None, "read": (), "close": ()}, spec)
         if not isinstance(own.camera, Camera):
             raise BadInput(f"camera {spec}: camera", type(own.camera).__name__, "a p2p_lib.Camera")
@@ -131,21 +165,14 @@ class OwnCamera:
 
         And where there is none: so many in a row, or all until its end, have another size.
         """
-        odd: list[WrongSize] = []
-        while len(odd) < _ODD_IN_A_ROW:
+        while True:
             try:
                 frame = self._next()
             except WrongSize as error:
-                odd.append(error)
+                self._odd.leave_out(error)
                 continue
-            if frame is None and odd and not self._fits:
-                break
-            for one in odd:
-                doubt(one.name, f"{one.got}, not {one.expected}", "It is left out.")
-            self._fits |= frame is not None
+            (self._odd.end if frame is None else self._odd.fits)()
             return frame
-        fix = f"{len(odd)} in a row were: make its camera, a p2p_lib.Camera, that of the images which it gives."
-        raise advised(odd[0], fix)
 
     def _next(self) -> Frame | None:
         """What it gives next; :class:`BadInput` for what is no frame, and an index that is not above the last one."""

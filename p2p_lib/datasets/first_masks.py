@@ -38,9 +38,14 @@ class FirstMasks:
         self.path, self._prompts, self._followed = path, prompts, set[str]()
         self._started, self._panels, self._corrected = list[str](), list[np.ndarray](), list[np.ndarray]()
 
-    def add(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> tuple[list[str], list[str]]:
-        """The masks that served in a frame; which objects are new in it, and which were corrected: both are drawn."""
-        self._followed &= masks.keys()  # what was removed may be added again
+    def add(
+        self, frame: Frame, masks: Mapping[str, np.ndarray | None], anew: Iterable[str] = ()
+    ) -> tuple[list[str], list[str]]:
+        """The masks that served in a frame; which objects are new in it, and which were corrected: both are drawn.
+
+        anew  objects that were added since the frame before, under a name that another one had, too
+        """
+        self._followed = (self._followed & masks.keys()).difference(anew)  # what was removed may be added again
         seen = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
         said = sorted((p for p in self._prompts if p.frame <= frame.index), key=lambda p: p.frame)
         newest = {prompt.name: prompt for prompt in said}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as SequenceOf
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -30,6 +31,8 @@ IfExists = Literal["refuse", "replace", "resume"]
 _ANEW = "--force, in Python if_exists='replace'"
 #: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
 _MAY_DIFFER = {"left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
+#: So many things of a kind are named, the others counted.
+_FEW = 3
 
 
 class RunWriter:
@@ -346,10 +349,28 @@ def _place(info: Mapping[str, Any]) -> str:
 
 
 def _prompts_alone(info: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """The prompts of one run that another does not have, in words."""
-    alone = [prompt for prompt in info["prompts"] or [] if prompt not in (other["prompts"] or [])]
-    said = [(p["name"], p["frame"], {key: p[key] for key in p if key not in ("name", "frame")}) for p in alone]
-    return ", ".join(f"{name!r} in frame {frame}: {str(what)[:60]}" for name, frame, what in said) or "nothing"
+    """The prompts of one run that another does not have, in words: of each what is not in the other's."""
+    theirs, said = other["prompts"] or [], list[str]()
+    for prompt in (prompt for prompt in info["prompts"] or [] if prompt not in theirs):
+        where = {"name": prompt["name"], "frame": prompt["frame"]}
+        like: Mapping[str, Any] = next((of for of in theirs if where.items() <= of.items()), where)
+        keys = [key for key in (prompt | like) if prompt.get(key) != like.get(key)]
+        what = "; ".join(_items_alone(key, prompt.get(key), like.get(key)) for key in keys)
+        said.append(f"{prompt['name']!r} in frame {prompt['frame']}: {what}")
+    return _few(said) or "nothing"
+
+
+def _items_alone(key: str, mine: Any, theirs: Any) -> str:
+    """Of clicks those that the other does not have, or how many; of all else what it is."""
+    if key not in ("points", "negative") or mine is None:
+        return f"no {key}" if mine is None else f"{key} {mine}"
+    alone = [f"({x:g}, {y:g})" for x, y in (at for at in mine if at not in (theirs or []))]
+    return f"{key} {_few(alone)}" if alone else f"{len(mine)} {key}"
+
+
+def _few(words: SequenceOf[str]) -> str:
+    """The first of them, and how many more there are."""
+    return ", ".join(words[:_FEW]) + f" and {len(words) - _FEW} more" * (len(words) > _FEW)
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:

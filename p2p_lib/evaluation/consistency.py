@@ -140,7 +140,8 @@ def consistency(
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, doubted)
         doubts = tuple(text for text in doubted if _is_about(text, name) and APART not in text)
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
-        evidence = gathered(obj, of_every_map, sequence, masks.get(name), keypoints.get(name), fit, doubts, moved)
+        kept_of = masks.get(name), keypoints.get(name)
+        evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved, bool(run.info.get("offline")))
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
         if obj.has_pose.any() and not evidence.compared:

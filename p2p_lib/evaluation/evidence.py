@@ -95,12 +95,14 @@ def gathered(
     fit: SurfaceFit,
     doubts: tuple[str, ...],
     moved: Collection[int] = (),
+    offline: bool = False,
 ) -> RunEvidence:
     """All that is known of one object, frame by frame.
 
     every   the same object with the poses of all its maps
     doubts  what was doubted of it when the run was made
     moved   frames whose pose an offline pass has moved far
+    offline whether its poses are that pass's
     """
     n = len(obj)
     px, size_m, cut, apart = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool), 0.0
@@ -117,9 +119,9 @@ def gathered(
     elsewhere = every.has_pose & ~obj.has_pose
     of_poses = obj.frame_index, obj.has_pose, elsewhere, obj.confidence
     seen, inside, off_px, jump_px = of_points
-    of_surface = fit.overlap, fit.through, fit.on_surface
+    compared = seen, inside, off_px, jump_px, fit.overlap, fit.through, fit.on_surface
     far = np.isin(obj.frame_index, list(moved))
-    return RunEvidence(*of_poses, px, size_m, cut, seen, inside, off_px, jump_px, *of_surface, far, doubts, apart)
+    return RunEvidence(*of_poses, px, size_m, cut, *compared, far, doubts, apart, offline)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

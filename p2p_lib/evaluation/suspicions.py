@@ -52,6 +52,7 @@ class RunEvidence:
     moved         (n,) bool: by an offline pass, more than three sigmas from the causal pose
     doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
+    offline       whether an offline pass made the poses, which are to be labels
     """
 
     frame_index: np.ndarray
@@ -71,6 +72,7 @@ class RunEvidence:
     moved: np.ndarray
     doubts: tuple[str, ...] = ()
     apart: float = 0.0
+    offline: bool = False
 
     @property
     def seen(self) -> np.ndarray:
@@ -177,6 +179,13 @@ _RULES = (
         0.05,
         lambda e: e.moved & (e.confidence <= DOUBTED),
         lambda e: e.has_pose,
+    ),
+    _Rule(
+        "labels",
+        "a sure offline pose that silhouette or depth contradicts",
+        0.2,
+        lambda e: (e.overlap < OVERLAP) | (e.on_surface < ON_SURFACE),
+        lambda e: (e.confidence > DOUBTED) & (np.isfinite(e.overlap) | np.isfinite(e.on_surface)) & e.offline,
     ),
     _Rule(
         "grown",

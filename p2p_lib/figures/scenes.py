@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -201,6 +201,8 @@ class Scene:
 
     def _label(self, camera: Camera, name: str, obj: ObjectRun, row: int) -> Label | None:
         """The object's name and status, at its estimated box, else its true one, else where it was last seen."""
+        if not obj.followed[row]:
+            return None
         before = np.flatnonzero(obj.has_pose[: row + 1])
         box: OrientedBox | None
         if not obj.has_pose[row] and name in self._model_boxes and obj.has_truth[row]:
@@ -235,13 +237,19 @@ def side_by_side(
 
 
 def draw_live(
-    method: Point2Pose, frame: Frame, estimates: Mapping[str, PoseEstimate], title: str, start_s: float = 0.0
+    method: Point2Pose,
+    frame: Frame,
+    estimates: Mapping[str, PoseEstimate],
+    title: str,
+    start_s: float = 0.0,
+    names: Iterable[str] = (),
 ) -> np.ndarray:
     """The tracker's own view of a frame: masks, boxes, axes, statuses, and the map's keypoints (pending ones as rings).
 
     start_s  the time of the first frame, from which seconds are counted
+    names    objects so far, removed ones too, in whose order they get their colours
     """
-    colours, labels = style.object_colours(method.objects), []
+    colours, labels = style.object_colours(dict.fromkeys([*names, *method.objects])), []
     masks = {name: mask for name, mask in method.masks.items() if mask is not None}
     image = overlay.draw_masks(frame.rgb, masks, colours, fill=_FILL)
     for name, estimate in estimates.items():

@@ -161,9 +161,10 @@ class ObjectTracker:
         requests = self.model.insert_keyframe(obs, T_cam_obj, uv_px, p_cam, np.zeros(0, bool))
         self.model.adopt()
         self.life = self.policy.begun(obs, T_cam_obj, verdict)
-        # The first pose defines the object frame: it is right by definition, whatever the points are worth.
-        covariance, inliers = self.model.covariance, len(self.map)
-        estimate = self._estimate(obs, verdict, confidence=1.0, covariance=covariance, inliers=inliers, keyframe=True)
+        # The first pose defines the object frame: it is right by definition, but of few points nothing can be followed.
+        confidence = min(1.0, len(self.map) / self.config.registration.min_inliers)
+        pose = {"confidence": confidence, "covariance": self.model.covariance, "inliers": len(self.map)}
+        estimate = self._estimate(obs, verdict, keyframe=True, **pose)
         return ObjectStep(estimate, requests)
 
     def _sample(self, obs: Observation) -> tuple[np.ndarray, np.ndarray]:

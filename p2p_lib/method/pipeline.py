@@ -10,7 +10,6 @@ What a caller writes:
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,11 +25,9 @@ from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.objects import FollowedT, Objects
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import Frame, PoseEstimate, Status, Tracks
+from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
 from p2p_lib.method.object_tracker import ObjectTracker
-
-_LOG = logging.getLogger("p2p_lib")
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class Point2Pose(Objects[FollowedT]):
 
     config  parameters, or the name of a preset
 
-    Changes of status go to the logger ``p2p_lib``. :meth:`close`, or the end of a ``with`` block, ends its threads.
+    What becomes of objects goes to the logger ``p2p_lib``. :meth:`close`, or a ``with`` block's end, ends its threads.
     """
 
     def __init__(
@@ -78,7 +75,6 @@ class Point2Pose(Objects[FollowedT]):
         self.stopwatch = Stopwatch()
         self._executor = ThreadPoolExecutor(2, "p2p")
         self.front = self._parts.front(camera, tracker, segmenter, self.objects, self.stopwatch, self._executor)
-        self._status: dict[str, Status] = {}
 
     @property
     def tracker(self) -> PointTracker:
@@ -123,7 +119,7 @@ class Point2Pose(Objects[FollowedT]):
             self.front.apply({name: step.requests for name, step in steps.items()})
             said = {name: steps[name].estimate for name in self.objects if name in steps}
             estimates = {n: self.explained(e, tracked.frame, self.masks[n], tracked.masks[n]) for n, e in said.items()}
-        self._log(estimates)
+        self.journal.note(estimates, self.stopwatch.last_ms["total"])
         return estimates
 
     def _inputs(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> FrameInputs:
@@ -146,14 +142,6 @@ class Point2Pose(Objects[FollowedT]):
         rng = np.random.default_rng([self.config.seed, *name.encode()])
         made_of = self.camera, self.config, self.detector, rng, self.stopwatch, self._executor
         self.objects[name] = self._parts.object(name, *made_of, map_id=self._next_map.get(name, 0))
-
-    def _log(self, estimates: Mapping[str, PoseEstimate]) -> None:
-        """Log every object whose status has changed."""
-        for name, estimate in estimates.items():
-            if estimate.status != self._status.get(name):
-                self._status[name] = estimate.status
-                why = f" ({estimate.reason})" if estimate.reason else ""
-                _LOG.info("frame %d: %s is %s%s", estimate.frame_index, name, estimate.status, why)
 
     # -- the end -------------------------------------------------------------------------------
 

@@ -353,7 +353,7 @@ def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsy
         capsys.readouterr()
         assert run(sequence, out, *more, *words) == 2 and said in one_line(capsys)
     assert run(sequence, out, *prompts(), "--save-masks", "--resume", "--from", "7") == 2
-    lacks = "prompts: got nothing, expected 'gone' in frame 6: {'mask_px': "
+    lacks = "prompts: got nothing, expected 'gone' in frame 6: mask_px "
     assert lacks in one_line(capsys)
     assert contents(out) == before
     prompts(hidden)

@@ -12,7 +12,9 @@ import threading
 import time
 import warnings
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -23,7 +25,7 @@ import pytest
 import trimesh
 
 from p2p_lib.apps import cli
-from p2p_lib.apps.live import LiveOptions, _warm_up, json_line, text_line, track_live
+from p2p_lib.apps.live import LiveOptions, _filmed, _warm_up, json_line, text_line, track_live
 from p2p_lib.apps.live_click import LiveClicker
 from p2p_lib.apps.live_words import KEPT, Words, outlet
 from p2p_lib.core.camera import Camera
@@ -38,12 +40,14 @@ from p2p_lib.datasets import cameras, run_writer
 from p2p_lib.datasets.cameras import FolderCamera, Newest, open_camera
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.prompts import run_lengths, save_prompts
+from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.evaluation.consistency import consistency
 from p2p_lib.evaluation.known_size import Watch
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures.film import write_film
+from p2p_lib.keeper import Keeper
 from p2p_lib.run import run
 from p2p_lib.trackers.lk import LkTracker
 from tests.apps.test_cli import POINTS_ALONE
@@ -304,6 +308,40 @@ def test_a_run_is_kept_and_filmed(folder, tmp_path):
     for film in ("film.mp4", "again.mp4"):
         with av.open(str(tmp_path / film)) as container:
             assert sum(1 for _ in container.decode(video=0)) == count.frames
+
+
+def test_each_object_keeps_its_colour_in_the_film():
+    """Whichever were removed before, and also once it is added again."""
+    masks = {name: np.zeros((H, W), bool) for name in ("mug", "tin")}
+    masks["mug"][40:60, 10:30] = masks["tin"][40:60, 50:70] = True
+    method, film = SimpleNamespace(objects=masks, masks=masks), []
+    listen = _filmed(SimpleNamespace(add=lambda image, time_s: film.append(image)), "camera", method, None)
+    for k, followed in enumerate((["mug", "tin"], ["tin"], ["tin", "mug"])):
+        method.objects = method.masks = {name: masks[name] for name in followed}
+        listen(picture(k), {})
+    both, alone, again = film
+    assert (alone[masks["tin"]] == both[masks["tin"]]).all() and (again[40:] == both[40:]).all()
+    assert (alone[masks["mug"]] == 0).all() and (both[50, 20] != both[50, 60]).any()
+
+
+def test_an_object_that_is_added_again_before_the_next_frame_is_a_new_one(folder, tmp_path, caplog):
+    """And no correction of the one that had its name."""
+    caplog.set_level("INFO", "p2p_lib")
+    sequence, said = open_sequence(folder), list(PROMPTS)
+    method = Point2Pose(sequence.camera, preset("default").with_values(SETTINGS))
+    with RunWriter(tmp_path / "run", sequence, method.config, "builtin", "clicks") as writer:
+        keeper, drawn = Keeper(writer, method, prompts=said), []
+        for k in range(4):
+            if k == 2:
+                method.remove_object("board")
+            if k in (0, 2, 3):
+                said.append(replace(PROMPTS[0], frame=k))
+                method.tell(said[-1])
+            drawn.append(keeper.add(sequence.frame(k), method.step(sequence.frame(k))))
+    assert drawn == [(["board"], []), ([], []), (["board"], []), ([], ["board"])]
+    turns = [text for text in caplog.messages if re.search("begins|removed|corrected", text)]
+    first, second = ("frame 0: board begins, is tracked", "frame 2: board begins, is tracked")
+    assert turns == [first, "board is removed", second, "frame 3: board is corrected"]
 
 
 def test_stopping_a_camera_ends_its_run_well(scripted, folder, tmp_path):

@@ -12,10 +12,10 @@ from p2p_lib.core.errors import BadInput
 CAMERA = Camera(615.2, 613.9, 318.4, 243.1, 640, 480)
 cameras = st.builds(
     Camera,
-    fx=st.floats(400, 3000),
-    fy=st.floats(50, 3000),
-    cx=st.floats(-100, 2000),
-    cy=st.floats(-100, 2000),
+    fx=st.floats(820, 3000),
+    fy=st.floats(820, 3000),
+    cx=st.floats(-100, 4000),
+    cy=st.floats(-100, 4000),
     width=st.integers(1, 4000),
     height=st.integers(1, 4000),
 )
@@ -29,6 +29,26 @@ def test_a_focal_length_in_letters_is_refused():
 def test_shares_of_the_width_are_no_pixels():
     with pytest.raises(BadInput, match=r"camera: got fx = 0\.96 for 640 columns, expected focal lengths in pixels"):
         Camera(0.96, 1.28, 0.5, 0.5, 640, 480)
+
+
+def test_a_principal_point_that_no_part_of_an_image_has_is_refused():
+    """A part of a larger image may have it far outside; one of nine focal lengths away nobody has."""
+    far = r"got cx = 5000 for 640 columns, of which one is 83 degrees off the axis, expected 79 degrees at most"
+    with pytest.raises(BadInput, match=f"camera: {far}"):
+        Camera(600, 600, 5000, 240, 640, 480)
+    with pytest.raises(BadInput, match=f"cam_K.txt: {far}"):
+        Camera.from_K(np.array([[600, 0, 5000], [0, 600, 240], [0, 0, 1]]), 640, 480, "cam_K.txt")
+    with pytest.raises(BadInput, match="got cy = -4000 for 480 rows"):
+        Camera(600, 600, 320, -4000, 640, 480)
+    assert Camera(600, 600, -1300, 900, 64, 48).resized(640, 480).cx == -12995.5
+
+
+@given(cameras, st.tuples(*[st.floats(0, 1)] * 4), st.integers(1, 2000))
+def test_every_part_of_an_image_at_every_size_has_a_camera(camera, at, width):
+    left, right = sorted(round(x * (camera.width - 1)) for x in at[:2])
+    top, bottom = sorted(round(y * (camera.height - 1)) for y in at[2:])
+    size = right + 1 - left, bottom + 1 - top
+    Camera(camera.fx, camera.fy, camera.cx - left, camera.cy - top, *size).resized(width, 480)
 
 
 def test_nine_numbers_are_a_matrix_row_by_row():

@@ -17,7 +17,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets import run_writer
-from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.datasets.run_writer import RunWriter, _prompts_alone
 from p2p_lib.datasets.runs import COLUMNS, load_run
 from p2p_lib.datasets.sequence import open_sequence
 
@@ -336,3 +336,15 @@ def test_where_it_comes_out_otherwise_nothing_is_lost(folder, tmp_path):
         add(w, 3)
         raise KeyboardInterrupt
     assert contents(out) == before
+
+
+def test_of_prompts_that_differ_what_the_other_lacks_is_told_to_its_end():
+    """However many clicks they have in common."""
+    shared = [[k, 10.0] for k in range(100, 120)]
+    before = {"name": "mug", "frame": 0, "points": shared, "box": [0, 0, 9, 9]}
+    after = {"name": "mug", "frame": 0, "points": [*shared, *([k, 20.5] for k in range(5))], "negative": [[7, 8]]}
+    mine, theirs = {"prompts": [after]}, {"prompts": [before]}
+    clicks = "points (0, 20.5), (1, 20.5), (2, 20.5) and 2 more"
+    assert _prompts_alone(mine, theirs) == f"'mug' in frame 0: {clicks}; negative (7, 8); no box"
+    assert _prompts_alone(theirs, mine) == "'mug' in frame 0: 20 points; box [0, 0, 9, 9]; no negative"
+    assert _prompts_alone(mine, mine) == "nothing"

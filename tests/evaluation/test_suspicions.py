@@ -55,6 +55,18 @@ def test_a_rule_counts_frames_and_names_them(rule):
     assert f"frames 30 to {29 + round(many * N)}" in found.text
 
 
+@pytest.mark.parametrize(("wrong", "share"), [({"on_surface": 0.5}, 0.26), ({"overlap": 0.4}, 0.15)])
+def test_offline_poses_are_to_be_labels_of_which_few_may_be_doubtful(wrong, share):
+    """By the rule of each label, whichever way it does not fit; those that are not sure are none."""
+    bad = with_some(spotless(), share, **wrong)
+    other = np.where(ROWS >= 90, 0.5, bad.on_surface)  # a tenth more, elsewhere
+    assert not suspicions(bad) and not suspicions(replace(bad, on_surface=other))
+    (found,) = suspicions(replace(bad, on_surface=other, offline=True))
+    assert found.rule == "labels" and len(found.frames) == round(share * N) + 10
+    unsure = np.where((other < 0.6) | (bad.overlap < 0.5), 0.5, 0.9)
+    assert not suspicions(replace(bad, on_surface=other, offline=True, confidence=unsure))
+
+
 def test_maps_that_never_met():
     e = with_some(spotless(), 0.2, has_pose=False, elsewhere=True)
     assert {s.rule for s in suspicions(e)} == {"maps"}, "each frame speaks against it once"
@@ -111,6 +123,7 @@ def test_what_is_not_known_is_not_held_against_anybody():
         "cut",
         "doubts",
         "apart",
+        "offline",
     }
     nothing = replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})
     assert suspicions(nothing) == () and spotless().compared and not nothing.compared

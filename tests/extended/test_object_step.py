@@ -3,6 +3,7 @@
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -711,9 +712,18 @@ def test_an_object_with_next_to_no_texture_starts_on_its_surface():
     lump, points_alone = Lump(), Lump(**NO_SURFACE)
     lump.tracker.own.detector = points_alone.tracker.own.detector = Pair()
     assert points_alone.see(START).estimate.reason == "only 2 points to start a map"
-    assert lump.see(START).estimate.status is Status.DEGRADED
+    started = lump.see(START).estimate
+    assert started.status is Status.DEGRADED and started.confidence == 2 / lump.tracker.config.registration.min_inliers
     lump.see(turned(3))
     assert lump.off(turned(3))[0] < 1
+
+
+def test_a_start_without_any_points_has_no_confidence():
+    lump, rich = Lump(), Lump()
+    lump.tracker.own.detector = SimpleNamespace(detect=lambda frame, region: Candidates(np.zeros((0, 2)), np.zeros(0)))
+    started = lump.see(START).estimate
+    assert (started.confidence, started.inliers, started.reason) == (0, 0, "only 0 points to start a map")
+    assert rich.see(START).estimate.confidence == 1
 
 
 def test_an_object_that_still_comes_into_view_is_not_started():

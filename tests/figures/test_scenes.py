@@ -11,6 +11,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets.run_writer import RunWriter
+from p2p_lib.datasets.runs import NOT_FOLLOWED
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.figures import overlay, style
 from p2p_lib.figures.overlay import OrientedBox
@@ -79,6 +80,14 @@ def test_the_label_of_a_doubted_pose_says_so(made, scene):
         said = replace(obj, confidence=np.full(len(obj), confidence))
         words.append(scene._label(made.sequence.camera, "box", said, row).text)
     assert words == [f"box: {obj.status[row]}, doubted", f"box: {obj.status[row]}"]
+
+
+def test_an_object_that_is_not_followed_any_more_has_no_label(made, scene):
+    obj = made.run.objects["box"]
+    row = int(np.flatnonzero(obj.has_pose)[-1])
+    gone = replace(obj, status=np.full(len(obj), "initialising"), reason=np.full(len(obj), NOT_FOLLOWED))
+    gone.T_cam_obj[row] = np.nan
+    assert scene._label(made.sequence.camera, "box", gone, row) is None
 
 
 def test_a_wrong_pose_is_drawn_where_it_is(made, scene):

@@ -309,7 +309,7 @@ def test_time_that_runs_backwards_is_warned_of_once_and_statuses_are_logged(capl
         "Give frames in the order in which they were taken.",
     ]
     first = estimates[0]["left"].status
-    assert caplog.messages[0].startswith(f"frame 0: left is {first}")
+    assert caplog.messages[0].startswith(f"frame 0: left begins, is {first}")
     reasons = [estimate["left"].reason for estimate in estimates]
     told = [f"its time is {k / 30:.6f} s, not later than the frame before ({(k + 1) / 30:.6f} s)" for k in (1, 0)]
     assert [reason.partition("; ")[2] or reason for reason in reasons] == ["", "", "", *told, ""], "each in its frame"

@@ -396,6 +396,23 @@ def test_what_no_click_contradicts_stays(was, say, left, right, wall):
         assert found[part].mean() == pytest.approx(share, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("say", "stays"),
+    [
+        ({"negative_px": [[175, 110]]}, False),
+        ({"points_px": [[61, 101]], "negative_px": [[175, 110]]}, True),
+        ({"points_px": [[110, 100]]}, True),
+    ],
+    ids=["a click beside the object", "and one on the speck", "clicks on the object alone"],
+)
+def test_specks_go_where_clicks_take_something_away(say, stays):
+    """Unless one is clicked on; another part, that is no speck, stays all the same."""
+    frame, follow, speck = picture(), segmenter(), rectangle(60, 100, 63, 103)
+    follow.segment(frame, [Prompt("left", mask=LEFT | RIGHT | WALL | speck)])
+    found = follow.segment(frame, [Prompt("left", **say)]) == 1
+    assert found[speck].any() == stays and found[WALL].mean() > 0.9
+
+
 def test_a_mask_is_corrected_in_the_image_that_it_is_of():
     """As the page shows what a click makes of a run's mask: nothing is followed from an image to itself."""
     odd = LEFT & ~rectangle(100, 90, 110, 100) | rectangle(60, 100, 90, 110)

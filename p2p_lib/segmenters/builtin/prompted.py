@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
@@ -65,6 +66,8 @@ _FILLED, _PER_UNFILLED = 0.7, 2.0
 _SCALES = {0.4: 0.5, 1.0: 1.0, 2.5: 0.7}
 #: Depth is looked for this far from a click that has none, px; what differs by less is one surface, m.
 _HOLE_PX, _ONE_SURFACE_M = 3, 0.02
+#: A part of a corrected mask that is less than this share of it is a speck.
+_SPECK = 0.02
 #: A click on something else claims the cells of the grid within this radius.
 _AROUND_PX = 3
 
@@ -208,7 +211,10 @@ class Cutter:
         return bool(len(clicks) and np.linalg.norm(away, axis=1).min() > np.ptp(ends, 0).max())
 
     def correct(self, was: np.ndarray) -> tuple[Box, np.ndarray]:
-        """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays."""
+        """Mend a mask (H, W) bool where a click contradicts it: what none contradicts stays, but for specks.
+
+        Those are what is left around a part that a click beside the object takes away.
+        """
         clicks, ends = self.prompt.points_px, ends_px(was)
         px = np.concatenate([ends, clicks, self.prompt.negative_px])
         fits = replace(self.config, side_px=2 * self.config.side_px)
@@ -220,7 +226,10 @@ class Cutter:
         x = self._mended(patch, on & ~apart, seeds, barred) > 0.5
         missed, extra = _parts(x & ~on, seeds), _parts(on & ~x & ~apart, barred) | apart
         add, take = (patch.up(part.astype(np.float32)) > 0.5 for part in (missed, extra))
-        return patch.box, (was[patch.box.slices] & ~take | add).astype(np.float32)
+        mended = was[patch.box.slices] & ~take | add
+        if len(self.prompt.negative_px):
+            mended &= ~_specks(mended, clicks - [patch.box.left, patch.box.top])
+        return patch.box, mended.astype(np.float32)
 
     def _mended(self, patch: Patch, on: np.ndarray, seeds: np.ndarray, barred: np.ndarray) -> np.ndarray:
         """(h, w) probability of an object whose mask was ``on`` (h, w) bool; ``seeds`` and ``barred`` are certain.
@@ -333,6 +342,15 @@ def _open(patch: Patch, side: np.ndarray, wrong: np.ndarray, right: np.ndarray) 
 def _parts(region: np.ndarray, at: np.ndarray) -> np.ndarray:
     """(h, w) bool: the parts of a region (h, w) bool that hold a cell of ``at`` (h, w) bool."""
     return components_touching(connected_components(region), at)
+
+
+def _specks(mask: np.ndarray, clicks_px: np.ndarray) -> np.ndarray:
+    """(h, w) bool: the parts of a mask (h, w) bool that are a small share of it and hold no click (K, 2) on it."""
+    _, part, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] < _SPECK * np.count_nonzero(mask)
+    u, v = nearest_px(clicks_px, mask.shape)
+    small[part[v, u]] = False
+    return mask & small[part]
 
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:

@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import re
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from p2p_lib.apps.live_words import KEPT
 from p2p_lib.core.backends import DEFAULT_SEGMENTER, DEFAULT_TRACKER
 from p2p_lib.core.compiled import warm_up
-from p2p_lib.core.errors import BadInput, MissingBackend, P2PError
+from p2p_lib.core.errors import BadInput, MissingBackend, P2PError, WrongSize
 from p2p_lib.core.memory import load_memories, load_memory
 from p2p_lib.core.options import RunOptions, pairs
-from p2p_lib.core.types import DOUBTED, PoseEstimate
+from p2p_lib.core.prompts import check_frame
+from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate
+from p2p_lib.datasets.cameras import OddImages
 from p2p_lib.datasets.prompts import load_prompts
+from p2p_lib.datasets.ros_messages import seconds
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import recall
 from point2pose_ros import messages
@@ -70,16 +75,28 @@ class TrackingNode:
         self.memories = load_memories(options.memory or ())
         self.tracker: Point2Pose | None = None
         self._headers: dict[int, Any] = {}  # of frames without an answer yet
-        self._count = 0
+        self._count, self._odd = 0, OddImages()
+        self._seen: deque[Frame] = deque(maxlen=KEPT)
 
     def on_images(self, rgb: Any, depth: Any, info: Any) -> None:
-        """One synchronised triple of messages; what is handed on is of an earlier one if the tracker is late."""
+        """One synchronised triple of messages; what is handed on is of an earlier one if the tracker is late.
+
+        Images of another size than the camera's are left out; so many in a row end it.
+        """
         if self.tracker is None:
             self.tracker = self._started(info)
+        try:
+            frame = messages.frame_of(self._count, rgb, depth)
+            check_frame(frame, self.tracker.camera)
+        except WrongSize as error:
+            self._odd.leave_out(error)
+            return
+        self._odd.fits()
         while self.prompts and self.prompts[0].frame <= self._count:
             self.tracker.tell(self.prompts.pop(0))
         self._headers[self._count] = rgb.header
-        estimates = self.tracker.step(messages.frame_of(self._count, rgb, depth))
+        estimates = self.tracker.step(frame)
+        self._seen.append(frame)
         self._count += 1
         if self.tracker.frame is not None:
             header = self._headers.pop(self.tracker.frame.index)
@@ -93,7 +110,7 @@ class TrackingNode:
             if not request.memory:
                 if request.name in self._running().objects:
                     raise BadInput("add_object", repr(request.name), "a name not in use")
-                self._running().tell(messages.prompt_of(request))
+                self._running().tell(messages.prompt_of(request), self._clicked_on(request))
                 return
             if request.points or request.negative or request.box.width or request.mask.width:
                 raise BadInput("add_object", "a memory and clicks", "one of them")
@@ -107,7 +124,7 @@ class TrackingNode:
         def mend() -> None:
             if request.name not in self._running().objects:
                 raise BadInput("correct_object", repr(request.name), f"one of {sorted(self._running().objects)}")
-            self._running().tell(messages.prompt_of(request))
+            self._running().tell(messages.prompt_of(request), self._clicked_on(request))
 
         return _answered(answer, mend)
 
@@ -121,6 +138,17 @@ class TrackingNode:
         surfaces = {name: obj.model.surface for name, obj in objects.items() if obj.model.surface is not None}
         made = {name: surface.mesh() for name, surface in surfaces.items()}
         return {name: mesh for name, mesh in made.items() if len(mesh.faces)}
+
+    def _clicked_on(self, request: Any) -> Frame | None:
+        """The image whose stamp a request has; None, which is the next one, without any."""
+        time_s = seconds(request.stamp)
+        if not time_s:
+            return None
+        for frame in self._seen:
+            if frame.time_s == time_s:
+                return frame
+        expected = f"that of one of the last {KEPT} images that were tracked"
+        raise BadInput(f"stamp of {request.name!r}", f"{time_s:.6f} s", expected, "Click on a newer image.")
 
     def _running(self) -> Point2Pose:
         if self.tracker is None:
