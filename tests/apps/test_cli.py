@@ -608,7 +608,7 @@ def test_config_explains_every_parameter_and_how_the_presets_differ(capsys):
 
 def test_log_says_what_becomes_of_objects(sequence, tmp_path, capsys, caplog):
     assert run(sequence, tmp_path / "out", "--stop", "3", "--log", "info") == 0
-    assert any("frame 0: object is" in message for message in caplog.messages)
+    assert any("frame 0: object begins, is tracked" in message for message in caplog.messages)
 
 
 def test_where_nothing_was_tracked_it_says_what_to_do(sequence, tmp_path, capsys):

@@ -37,14 +37,14 @@ def card_before_wall(at=CARD, card_m=0.9) -> tuple[Patch, np.ndarray, np.ndarray
 
 def test_what_is_connected_with_the_seeds_is_the_object():
     patch, seeds, card = card_before_wall()
-    log_odds, component, _ = by_geometry(patch, seeds, None, CONFIG)
+    log_odds, component = by_geometry(patch, seeds, None, CONFIG)
     assert component.sum() > 0.85 * card.sum() and not (component & ~card).any()
     assert (log_odds[component] == WEIGHT).all() and (log_odds[0] == -WEIGHT).all()
 
 
 def test_what_goes_on_beyond_the_patch_is_not_one_object():
     patch, seeds, _ = card_before_wall(np.s_[8:22, :])
-    log_odds, component, _ = by_geometry(patch, seeds, None, CONFIG)
+    log_odds, component = by_geometry(patch, seeds, None, CONFIG)
     assert not component.any() and not (log_odds > 0).any()
 
 
@@ -53,7 +53,7 @@ def test_depth_beyond_the_reach_is_background_even_without_an_edge():
     depth = np.repeat(np.linspace(0.85, 1.1, W, dtype=np.float32)[None], H, 0)
     patch, seeds = patch_of(depth), np.zeros((H, W), bool)
     seeds[15, 3] = True
-    log_odds, component, _ = by_geometry(patch, seeds, None, replace(CONFIG, reach_m=0.1))
+    log_odds, component = by_geometry(patch, seeds, None, replace(CONFIG, reach_m=0.1))
     far = np.abs(depth - depth[15, 3]) > 0.1
     assert not component.any() and (log_odds[far] < 0).all() and not log_odds[~far].any()
 
@@ -62,7 +62,7 @@ def test_a_slope_between_an_object_and_its_support_does_not_join_them():
     """Without the plane, all of it would be one thing that goes on beyond the patch."""
     patch, seeds, _ = card_before_wall(card_m=0.93)
     patch.depth_m[8:22, 22:38] = np.linspace(0.93, 1.0, 16)
-    _, component, _ = by_geometry(patch, seeds, WALL, CONFIG)
+    _, component = by_geometry(patch, seeds, WALL, CONFIG)
     assert component[9:20, 11:21].all() and not component[:, 37:].any() and not component[:7].any()
     assert not by_geometry(patch, seeds, None, CONFIG)[1].any()
 
@@ -72,7 +72,7 @@ def test_a_strip_above_the_support_plane_belongs_to_the_plane():
     low = np.zeros((H, W), bool)
     low[20:22, 10:30] = True
     patch.depth_m[low] = 0.995
-    log_odds, component, _ = by_geometry(patch, seeds, WALL, CONFIG)
+    log_odds, component = by_geometry(patch, seeds, WALL, CONFIG)
     assert component.any() and not (component & low).any()
     assert (log_odds[20, 14:26] == -WEIGHT).all(), "once: colour may say that it touches its support"
 
@@ -80,7 +80,7 @@ def test_a_strip_above_the_support_plane_belongs_to_the_plane():
 @pytest.mark.parametrize("plane", [WALL, None])
 def test_what_lies_flat_in_its_support_is_not_told_from_it_by_depth(plane):
     patch, seeds, _ = card_before_wall(card_m=0.999)
-    log_odds, component, _ = by_geometry(patch, seeds, plane, CONFIG)
+    log_odds, component = by_geometry(patch, seeds, plane, CONFIG)
     assert not log_odds.any() or plane is None
     assert not component.any()
 

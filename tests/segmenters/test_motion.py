@@ -146,7 +146,7 @@ def test_what_the_mask_touches_but_was_beside_it_a_frame_ago_is_not_taken_in():
     seeds, touched = plate.copy(), (rows[-1], columns[-1])
     seeds[touched] = True
     for beside, taken in ((part & ~seeds, False), (part & (np.arange(part.shape[1]) % 2 == 0), True), (None, True)):
-        _, component, _ = by_geometry(patch, seeds, None, CONFIG, beside=beside)
+        _, component = by_geometry(patch, seeds, None, CONFIG, beside=beside)
         assert component[plate].all() and component[part].all() == component[part].any() == taken
 
 
@@ -215,7 +215,7 @@ def test_where_the_wall_was_seen_through_it_is_not_the_object():
     inner = cv2.erode(part.astype(np.uint8), np.ones((5, 5))) > 0
     for what, taken in ((both, True), (later, False)):
         free = free_before(patch, what)
-        _, component, _ = by_geometry(patch, plate, None, CONFIG, what, free=free)
+        _, component = by_geometry(patch, plate, None, CONFIG, what, free=free)
         assert component[plate].all() and component[inner].all() == component[inner].any() == taken
 
 

@@ -420,21 +420,6 @@ def test_where_depth_jumped_the_mask_of_before_says_nothing():
     assert not found[:, :145].any() and iou(found, piece & (np.arange(320) >= 150)) > 0.6
 
 
-@pytest.mark.parametrize("stood_there", [False, True])
-def test_a_side_that_turns_into_view_may_reach_beyond_all_that_was_seen(stood_there):
-    """A narrow card is twice as wide in the next frame; not if the rest stood there before, as a hand that touches."""
-    narrow, rest, follow = card((100, 80), (24, 50)), card((124, 80), (22, 50)), segmenter()
-    for k in range(4):
-        frame = picture(k, [])
-        frame.rgb[narrow], frame.depth_m[narrow] = (190, 60, 50), CARD_M
-        if stood_there or k == 3:
-            frame.rgb[rest], frame.depth_m[rest] = (40, 220, 60), CARD_M
-        if k < 3:
-            frame.depth_m[:, 124:128] = WALL_M
-        found = follow.segment(frame, () if k else [Prompt("card", points_px=[[105, 90], [112, 110]])]) == 1
-    assert found[narrow].mean() > 0.9 and (found[rest].mean() < 0.2 if stood_there else found[rest].mean() > 0.8)
-
-
 def test_what_shows_after_a_gap_in_the_depth_need_not_be_the_object():
     """Half of a card loses its depth for a frame, and something in its colours has come before it when it is back."""
     at, follow = (100, 80), segmenter()
@@ -444,7 +429,7 @@ def test_what_shows_after_a_gap_in_the_depth_need_not_be_the_object():
         if half_m is not None:
             frame.depth_m[half] = half_m
         found = follow.segment(frame, () if k else on(card=at)) == 1
-        assert k != 1 or found[half].mean() > 0.99, "colours carry it where nothing is measured"
+        assert k != 1 or found[half].all(), "colours carry it where nothing is measured"
     assert not found[half].any() and found[card(at) & ~half].all()
 
 
@@ -717,6 +702,6 @@ def test_an_exposure_that_changes_its_colours_does_not_take_a_mask_from_its_poin
         frame = picture(k, [(at, 2)])
         frame.rgb[:], frame.rgb[card(at)] = (60, 120, 60), (200, 60, 50)
         if k == 4:
-            frame.rgb[:] = 240
+            frame.rgb[:], frame.rgb[card(at)] = (200, 60, 50), (60, 120, 60)
         found = follow.segment(frame, () if k else on(card=at), sure(card=at) if told else {}) == 1
     assert (iou(found, card(at)) > 0.8) == told

@@ -113,8 +113,8 @@ def half_lost(
     p.verified[followed:] = False
     T_cam_seg = segments.segments[0].fit.T_cam_seg.copy()
     T_cam_seg[0, 3] += shift_px * PX_M
-    own = slice(8, 8 + pairs)
-    match = Matched(T_cam_seg, p.p_seg[own], RIGHT[own] + [shift_px, 0], np.full(pairs, DEPTH_M))
+    own, found = slice(8, 8 + pairs), segments.segments[0].last_view.corners
+    match = Matched(T_cam_seg, p.p_seg[own], RIGHT[own] + [shift_px, 0], np.full(pairs, DEPTH_M), found)
     monkeypatch.setattr(motion_segments, "matched", lambda *_: match)
     return p, segments
 

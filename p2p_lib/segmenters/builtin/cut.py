@@ -6,7 +6,7 @@ Log-odds of different evidence add up; they are positive for the object.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -59,17 +59,6 @@ def standing_out(patch: Patch, where: np.ndarray) -> np.ndarray:
     return patch.smooth & (plane_heights(patch, plane) > max_plane_height_m(patch.sigma_m))
 
 
-class Geometry(NamedTuple):
-    """What depth says of a patch: log-odds (h, w), and the component (h, w) bool that is connected with the seeds.
-
-    The component is empty unless it looks like one object; ``beyond`` says that it goes on beyond the patch.
-    """
-
-    log_odds: np.ndarray
-    component: np.ndarray
-    beyond: bool = False
-
-
 def by_geometry(
     patch: Patch,
     seeds: np.ndarray,
@@ -78,18 +67,19 @@ def by_geometry(
     motions: Motions | None = None,
     beside: np.ndarray | None = None,
     free: np.ndarray | None = None,
-) -> Geometry:
+) -> tuple[np.ndarray, np.ndarray]:
     """Evidence that an object is connected in depth and is not what it stands on.
 
-    seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Parts beside the component that share its
-    ``motions`` are added to it. What touches the seeds, but was seen a frame ago ``beside`` (h, w) bool the object, or
-    was ``free`` (h, w) bool before, is not of it.
+    seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Returns the log-odds (h, w) and the
+    component (h, w) bool that is connected with the seeds, empty unless it looks like one object. Parts beside it
+    that share its ``motions`` are added to it. What touches the seeds, but was seen a frame ago ``beside`` (h, w) bool
+    the object, or was ``free`` (h, w) bool before, is not of it.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
     at = seeds & measured
     if not at.any():
-        return Geometry(log_odds, nothing)
+        return log_odds, nothing
     from_seeds_m = np.abs(patch.depth_m - approximate_median(patch.depth_m[at]))
     log_odds[measured & (from_seeds_m > config.reach_m)] -= config.geometry_weight
     smooth = patch.smooth if free is None else patch.smooth & ~free
@@ -97,7 +87,7 @@ def by_geometry(
         height, sigma_m = plane_heights(patch, plane), approximate_median(patch.sigma_m[at])
         above_m = approximate_median(height[at])
         if abs(above_m) < _STANDS_OUT * sigma_m:
-            return Geometry(log_odds, nothing)  # flat: depth does not tell it from what it lies on
+            return log_odds, nothing  # flat: depth does not tell it from what it lies on
         if above_m > 0:
             low = height < min(above_m / 2, max_plane_height_m(sigma_m))
             log_odds[measured & low] -= config.geometry_weight
@@ -113,9 +103,9 @@ def by_geometry(
     # What is as low as the plane has its penalty already: colour can outweigh one.
     log_odds[measured & ~dilated(component, 1) & (smooth | ~patch.smooth)] -= config.geometry_weight
     if not patch.encloses(component):
-        return Geometry(log_odds, nothing, beyond=True)  # it is more than this object, or than the patch
+        return log_odds, nothing  # it is more than this object
     log_odds[component] += config.geometry_weight
-    return Geometry(log_odds, component)
+    return log_odds, component
 
 
 def _mostly(part: np.ndarray, region: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ from p2p_lib.core.depth import depths_at
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, standing_out
-from p2p_lib.segmenters.builtin.outline import outlined
 from p2p_lib.segmenters.builtin.patch import (
     Patch,
     around,
@@ -49,14 +48,14 @@ def find(view: View, target: Target, hint: Hint, taken: np.ndarray) -> Claim:
     surface = by_surface(patch, hint, cfg)
     outside = ~dilated(seeds | (surface > 0), 3)
     plane = support_plane(patch, (patch.depth_m > 0) & outside)
-    log_odds, component, _ = by_geometry(patch, seeds, plane, cfg)
+    log_odds, component = by_geometry(patch, seeds, plane, cfg)
     colour = by_colour(patch, target.colours, outside & ~component, cfg)
     background = (patch.border() | barred) & ~seeds
     x = keep_seeded_components(cut(patch, log_odds + surface + colour, seeds=seeds, background=background), seeds)
     own_colours = colour[x > 0.5]
     # Back in another light it has other colours; points that agree on its pose are on it all the same.
     sure = hint.sighted or (hint.T_cam_obj is not None and target.seen is None)
-    return (patch.box, outlined(frame, patch, x)) if len(own_colours) and (sure or own_colours.mean() > 0) else None
+    return (patch.box, patch.up(x)) if len(own_colours) and (sure or own_colours.mean() > 0) else None
 
 
 def near_last(view: View, target: Target, hint: Hint) -> Hint:

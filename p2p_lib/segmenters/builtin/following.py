@@ -11,7 +11,6 @@ from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, strange, warped
 from p2p_lib.segmenters.builtin.motion import free_before, scene_stays
-from p2p_lib.segmenters.builtin.outline import outlined
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, keep_seeded_components, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX
 from p2p_lib.segmenters.builtin.target import Target
@@ -21,9 +20,6 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 _MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
 #: Depth that returns after none of the object's was measured is its own within this distance of its last, m.
 _REAPPEARS_WITHIN_M = 0.1
-#: Where what is connected with an object goes on beyond its patch, one so many times as wide is looked at. What that
-#: adds to the mask was mostly not beside it a frame ago: a hand was.
-_WIDER, _WAS_BESIDE = 1.6, 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +47,13 @@ class FlowPrediction:
         return self.patch.box, self.patch.up(self.prior)
 
 
-def predict(view: View, target: Target, wider: float = 1.0) -> FlowPrediction:
-    """Move the mask of an object that was seen a frame ago by the optical flow, on a patch so many times as wide."""
+def predict(view: View, target: Target) -> FlowPrediction:
+    """Move the mask of an object that was seen a frame ago by the optical flow."""
     frame, cfg, seen = view.frame, view.config, target.seen
     assert seen is not None and target.size_m is not None and view.previous is not None  # a frame ago
     px_per_m = view.focal_px / seen.z_m
     # Room for its full size, also where only a part of it showed.
-    half = wider * (np.maximum(target.size_m / 2, target.room_m) * px_per_m * (1 + cfg.margin) + ROOM_PX)
+    half = np.maximum(target.size_m / 2, target.room_m) * px_per_m * (1 + cfg.margin) + ROOM_PX
     patch = Patch.of(frame, around(seen.centre_px, half, frame.shape), view.camera, cfg)
     before = Patch.like(view.previous, patch.box, patch.cell_px, view.camera)
     image = np.zeros(frame.shape, np.float32)
@@ -75,74 +71,36 @@ def predict(view: View, target: Target, wider: float = 1.0) -> FlowPrediction:
     return FlowPrediction(patch, prior, jumped, shown, beside, bool(left), bool(doubtful))
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What speaks for the object around its predicted mask, all (h, w): log-odds of depth and surface, and regions.
-
-    foreign  bool: what has come before it
-    core     bool: what is certainly of it
-    beyond   whether what depth connects with it goes on beyond the patch
-    """
-
-    predicted: FlowPrediction
-    geometry: np.ndarray
-    surface: np.ndarray
-    component: np.ndarray
-    foreign: np.ndarray
-    core: np.ndarray
-    beyond: bool
-
-    @classmethod
-    def of(cls, view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: FlowPrediction) -> Evidence:
-        """Around a predicted mask."""
-        cfg, patch, prior = view.config, predicted.patch, predicted.prior
-        assert target.seen is not None  # a frame ago
-        T_cam_obj = hint.T_cam_obj if target.confident else None
-        motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
-        surface, free = by_surface(patch, hint, cfg, others), np.zeros(patch.shape, bool)
-        if motions is not None and holds((patch.box, patch.up(prior)), hint.uv_px):
-            free = free_before(patch, motions) & (surface <= 0)
-        foreign = predicted.jumped | free
-        core = (prior > 0.8) & ~(foreign | predicted.shown)
-        if not (core & (patch.depth_m > 0)).any():
-            core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
-        plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
-        known = T_cam_obj is not None and target.past.full
-        beside = predicted.beside & (surface <= 0) if known else None
-        geometry, component, beyond = by_geometry(patch, core, plane, cfg, motions, beside, free)
-        return cls(predicted, geometry, surface, component, foreign, core, beyond)
-
-    @property
-    def comes_into_view(self) -> bool:
-        """Whether depth connects what is new with the object: it was not beside it a frame ago, as a hand was."""
-        new = self.component & (self.predicted.prior < 0.5)
-        was_beside = new.any() and self.predicted.beside[new].mean() > _WAS_BESIDE
-        return bool(self.component.any() and not was_beside)
-
-
 def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predicted: FlowPrediction) -> Claim:
     """Cut the object out around its predicted mask.
 
-    A side that turns into view may reach beyond the patch, which has room for what has been seen. None if the object
-    has left: what shows there lies behind it, or has the surroundings' colours without its points.
+    None if it has left: what shows there lies behind it, or has the surroundings' colours without its points.
     """
-    assert target.colours is not None  # it was seen a frame ago
-    around = Evidence.of(view, target, hint, others, predicted)
-    if around.beyond:
-        wider = Evidence.of(view, target, hint, others, predict(view, target, _WIDER))
-        around = wider if wider.comes_into_view else around
-    predicted, component, foreign = around.predicted, around.component, around.foreign
     cfg, patch, prior = view.config, predicted.patch, predicted.prior
+    assert target.seen is not None and target.colours is not None  # a frame ago
+    T_cam_obj = hint.T_cam_obj if target.confident else None
+    motions = None if T_cam_obj is None else target.past.motions(view.frame, T_cam_obj)
+    surface, free = by_surface(patch, hint, cfg, others), np.zeros(patch.shape, bool)
+    if motions is not None and holds((patch.box, patch.up(prior)), hint.uv_px):
+        free = free_before(patch, motions) & (surface <= 0)
+    foreign = predicted.jumped | free
+    core = (prior > 0.8) & ~(foreign | predicted.shown)
+    if not (core & (patch.depth_m > 0)).any():
+        core |= predicted.shown & (np.abs(patch.depth_m - target.seen.z_m) < _REAPPEARS_WITHIN_M)
+    plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
+    known = T_cam_obj is not None and target.past.full
+    beside = predicted.beside & (surface <= 0) if known else None
+    log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside, free)
     stays = cfg.prior_weight * np.where(foreign | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
     # Parts that come into view are connected with those that were seen before.
-    log_odds = around.geometry + np.where(component, np.maximum(stays, 0), stays)
+    log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[foreign] -= cfg.geometry_weight
-    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~dilated(component, 1), cfg) + around.surface
-    x = keep_seeded_components(cut(patch, log_odds, start=prior), around.core)
+    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + surface
+    x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)
-    claim = patch.box, outlined(view.frame, patch, x)
+    claim = patch.box, patch.up(x)
     if predicted.left and not (x > 0.5).any():
         return None
     # Exposure changes colours: points that agree overrule them.
@@ -166,7 +124,7 @@ def with_room(view: View, target: Target, hint: Hint) -> Target:
         return target
     plane = support_plane(patch, patch.depth_m > 0)
     free = free_before(patch, motions)
-    component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions, free=free).component
+    _, component = by_geometry(patch, patch.dots(hint.uv_px, 0), plane, cfg, motions, free=free)
     if not component.any():
         return target
     away_px = np.abs(patch.ends_px(component) - target.seen.centre_px).max(0)

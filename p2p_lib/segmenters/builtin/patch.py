@@ -91,18 +91,13 @@ class Patch:
     @classmethod
     def like(cls, frame: Frame, box: Box, cell_px: int, camera: Camera) -> Patch:
         """The patch of a frame on a given grid: a box of whole cells."""
-        rgb, z = averaged(frame.rgb[box.slices], cell_px), _middles(frame.depth_m[box.slices], cell_px)
+        rgb, z = _averaged(frame.rgb[box.slices], cell_px), _middles(frame.depth_m[box.slices], cell_px)
         return cls(box, cell_px, camera, rgb, z, depth_noise_m(z))
 
     @cached_property
     def gray(self) -> np.ndarray:
         """(h, w) uint8."""
         return cv2.cvtColor(self.rgb, cv2.COLOR_RGB2GRAY)
-
-    @cached_property
-    def lab(self) -> np.ndarray:
-        """(h, w, 3) float32, CIELAB as OpenCV scales it."""
-        return cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
 
     @cached_property
     def codes(self) -> np.ndarray:
@@ -125,7 +120,8 @@ class Patch:
     @cached_property
     def edge_weights(self) -> tuple[np.ndarray, np.ndarray]:
         """Ties of neighbouring cells, see :func:`p2p_lib.segmenters.builtin.random_walk.edge_weights`."""
-        return random_walk.edge_weights(self.lab, self.depth_m, self.step_m)
+        lab = cv2.cvtColor(self.rgb, cv2.COLOR_RGB2LAB).astype(np.float32)
+        return random_walk.edge_weights(lab, self.depth_m, self.step_m)
 
     def outline_tie(self, mask: np.ndarray) -> float:
         """Mean tie across the outline of a mask (h, w) bool: 0 if all of it is edges, 1 if none is or there is none."""
@@ -140,7 +136,7 @@ class Patch:
 
     def down(self, image: np.ndarray) -> np.ndarray:
         """A float image (H, W), averaged onto the grid."""
-        return averaged(image[self.box.slices], self.cell_px)
+        return _averaged(image[self.box.slices], self.cell_px)
 
     def nearest(self, image: np.ndarray) -> np.ndarray:
         """An image (H, W) on the grid, sampled at the cells' middles."""
@@ -225,7 +221,7 @@ def _whole_cells(box: Box, cell_px: int, shape: tuple[int, int]) -> Box:
     return Box(*low.tolist(), *(low + size).tolist())
 
 
-def averaged(image: np.ndarray, cell_px: int) -> np.ndarray:
+def _averaged(image: np.ndarray, cell_px: int) -> np.ndarray:
     """The means of an image (rows, columns, ...) over its cells."""
     size = image.shape[1] // cell_px, image.shape[0] // cell_px
     return image.copy() if cell_px == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)

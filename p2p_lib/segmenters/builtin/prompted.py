@@ -57,8 +57,6 @@ _NOT_IT = 3.0
 _TOLERANCE_PX = 3.0
 #: Cuts in the wide box and in the tight one; weight, in the background's colours, of a cell at a click beside it.
 _ROUNDS, _ROUNDS_MORE, _OTHERS = 3, 2, 30.0
-#: Weight of what is clicked on where a mask is wrong, of that of the side's colours: it may be all that shows them.
-_CLICKED = 0.05
 #: A box may be filled by a mask's own box up to this intersection over union without doubt, which then grows so fast.
 _FILLED, _PER_UNFILLED = 0.7, 2.0
 #: Clicks may be close together on something large, or at the ends of something thin: the scales tried, as the object's
@@ -245,7 +243,7 @@ class Cutter:
             known[may_be_on] = _REACHED * self._reached(patch)[may_be_on]
         own, other, x = kept.astype(np.float32), rest.astype(np.float32), on.astype(np.float32)
         for _ in range(_ROUNDS_MORE):
-            shares = by_shares(patch, _with_clicks(own, missed), _with_clicks(other, extra), self.config)
+            shares = by_shares(patch, own + _OTHERS * missed, other + _OTHERS * extra, self.config)
             background = (barred | patch.border()) & ~seeds
             x = cut(patch, known + shares, start=x, seeds=seeds, background=background, sharp=True)
             own, other = np.maximum(2 * x - 1, 0), np.maximum(1 - 2 * x, 0)
@@ -320,11 +318,6 @@ def _measured(clicks_px: np.ndarray, frame: Frame) -> np.ndarray:
     near = np.isfinite(z_m) & (z_m < z_m.min(1, keepdims=True) + _ONE_SURFACE_M)
     moved, rows, first = near.any(1) & np.isinf(z_m[:, 0]), np.arange(len(clicks_px)), near.argmax(1)
     return np.where(moved[:, None], np.stack([u, v], -1)[rows, first], clicks_px)
-
-
-def _with_clicks(side: np.ndarray, clicked: np.ndarray) -> np.ndarray:
-    """The weights (h, w) of a side's colours, in which cells ``clicked`` on (h, w) bool have a fixed share."""
-    return side + _CLICKED * side.sum() / max(np.count_nonzero(clicked), 1) * clicked
 
 
 def _open(patch: Patch, side: np.ndarray, wrong: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -220,7 +220,8 @@ class MotionSegments:
         for s, segment in enumerate(self.segments):
             own = p.visible & (p.segment == s)
             if segment.posed and np.count_nonzero(own) >= 2 * self.config.segment_min_points:
-                segment.last_view = SegmentView(now, p.uv[own], segment.fit.T_cam_seg, search)
+                found = None if segment.matched is None else segment.matched.found
+                segment.last_view = SegmentView(now, p.uv[own], segment.fit.T_cam_seg, search, found)
 
     def _split(self, p: Points, strays: np.ndarray, now: Image) -> None:
         """Points that leave their segment together stay verified, and are a new segment once they are far enough.

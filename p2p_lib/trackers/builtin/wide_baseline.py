@@ -8,7 +8,7 @@ matched with those of the newest frame, both ways, and the rigid motion that mos
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -18,12 +18,13 @@ from scipy.spatial import cKDTree
 from p2p_lib.core import robust, se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.depth import depth_noise_m
+from p2p_lib.core.image import in_mask
 from p2p_lib.trackers.builtin.features import mutual_match
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Corners, corners
 
 #: Corners that are described on a segment, and where it may be in the next frame: what a search costs at most.
-CORNERS, _MOST = 400, 1600
+CORNERS, _MOST = 400, 900
 #: A segment reaches so far beyond the hull of its points; it may move by these from frame to frame.
 _BESIDE_PX, _MOVES_PX, _MOVES_M = 6, 80, 0.08
 #: Corners nearer to the border of a region are of its outline, px.
@@ -48,12 +49,14 @@ class SegmentView:
     """A segment where it was last seen: the image, its visible points uv_px (N, 2), its pose T_cam_seg.
 
     search  (H, W) bool: where the objects were in that frame; None where nobody knows
+    found   corners of the whole region that was searched in that frame; None where it was not
     """
 
     image: Image
     uv_px: np.ndarray
     T_cam_seg: np.ndarray
     search: np.ndarray | None = None
+    found: Corners | None = field(default=None, repr=False)
 
     @cached_property
     def own(self) -> np.ndarray:
@@ -66,7 +69,11 @@ class SegmentView:
     @cached_property
     def corners(self) -> Corners:
         """The corners on the segment: those near points of it in space, for a hand may be before it."""
-        found = corners(self.image, self.own, CORNERS)
+        found = self.found
+        if found is None:
+            found = corners(self.image, self.own, CORNERS)
+        else:
+            found = found.select(in_mask(found.uv_px, self.own))
         z = self.image.depth_at(self.uv_px)
         p_cam = self.image.camera.unproject(self.uv_px[z > 0], z[z > 0])
         if len(p_cam) < 2:
@@ -102,12 +109,16 @@ class SegmentView:
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """The pose T_cam_seg (4, 4) that pairs agree on; of those p_seg (M, 3), uv_px (M, 2), z_m (M,)."""
+    """The pose T_cam_seg (4, 4) that pairs agree on; of those p_seg (M, 3), uv_px (M, 2), z_m (M,).
+
+    found  the corners that were searched
+    """
 
     T_cam_seg: np.ndarray
     p_seg: np.ndarray
     uv_px: np.ndarray
     z_m: np.ndarray
+    found: Corners
 
     def __len__(self) -> int:
         return len(self.p_seg)
@@ -148,4 +159,4 @@ def matched(then: SegmentView, found: Corners, cfg: TrackingConfig, rng: np.rand
         return None
     agree = fit.residual_m <= np.maximum(cfg.segment_inlier_m, limit_m)
     p_seg = se3.transform(se3.inverse(then.T_cam_seg), p_then[agree])
-    return Matched(fit.T_a_b @ then.T_cam_seg, p_seg, found.uv_px[corner[agree]], p_cam[agree, 2])
+    return Matched(fit.T_a_b @ then.T_cam_seg, p_seg, found.uv_px[corner[agree]], p_cam[agree, 2], found)
