@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from p2p_lib.core.camera import Camera
@@ -16,6 +18,8 @@ CELLS = np.s_[::CELL_PX, ::CELL_PX]
 _ENDS = 0.05
 #: A mask that holds something so many times as long as usual holds something else besides.
 GROWN = 1.3
+#: It is measured in every so many frames, and of so many the usual length is taken.
+_MEASURED, _LENGTHS = 5, 300
 
 
 def mask_length_m(frame: Frame, mask: np.ndarray, camera: Camera) -> float:
@@ -40,6 +44,28 @@ def length_and_middle(p_cam: np.ndarray) -> tuple[float, np.ndarray]:
     axis = np.linalg.eigh(np.cov(near.T))[1][:, -1] if len(near) > 3 else np.array([1.0, 0, 0])
     along_m = np.quantile(p_cam @ axis, [_ENDS, 1 - _ENDS])
     return float(np.ptp(along_m)) / (1 - 2 * _ENDS), centre_m
+
+
+class UsualLengths:
+    """How long what each object's masks hold usually is; tells a correction that makes it much longer."""
+
+    def __init__(self, camera: Camera):
+        self._camera = camera
+        self._lengths_m: dict[str, deque[float]] = {}
+
+    def forget(self, name: str) -> None:
+        """Nothing is known of an object any more."""
+        self._lengths_m.pop(name, None)
+
+    def doubt(self, name: str, frame: Frame, mask: np.ndarray | None, prompted: bool) -> str:
+        """What is doubtful about an object's mask (H, W) bool in a frame, ``prompted`` there or not; often nothing."""
+        before_m = self._lengths_m.setdefault(name, deque(maxlen=_LENGTHS))
+        if mask is None or not (prompted or frame.index % _MEASURED == 0 or not before_m):
+            return ""
+        length_m = mask_length_m(frame, mask, self._camera)
+        said = doubt_growth(name, frame.index, length_m, np.array(before_m)) if prompted else ""
+        before_m.extend([length_m] if np.isfinite(length_m) else [])
+        return said
 
 
 def doubt_growth(name: str, frame_index: int, length_m: float, before_m: np.ndarray) -> str:

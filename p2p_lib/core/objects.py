@@ -21,6 +21,7 @@ from p2p_lib.core.errors import BadInput, did_you_mean, doubt
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import PointTracker, Segmenter
 from p2p_lib.core.journal import Journal
+from p2p_lib.core.mask_length import UsualLengths
 from p2p_lib.core.prediction import Prediction, Predictor
 from p2p_lib.core.prompts import Prompt, check_apart, check_depth, check_frame, check_prompt, given_masks
 from p2p_lib.core.types import DOUBTED, NOT_FOUND, NOT_SEEN, OUT_OF_VIEW, Frame, PoseEstimate, Status
@@ -69,7 +70,8 @@ class Objects(ABC, Generic[FollowedT]):
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._unstarted: dict[str, str] = {}  # objects, and why what was selected of them last did not start them
         self._turn, self.closed = RLock(), False
-        self._predictor, self.journal = Predictor(), Journal()
+        self._predictor, self.journal, self._lengths = Predictor(), Journal(), UsualLengths(camera)
+        self._prompted: set[tuple[str, int]] = set()  # objects, and frames that came with a prompt of theirs
         self._cameras: deque[tuple[float, np.ndarray | None]] = deque()  # time and T_world_cam of frames, as given
 
     @contextmanager
@@ -212,6 +214,7 @@ class Objects(ABC, Generic[FollowedT]):
                 kept.pop(name, None)
             self._predictor.forget(name)
             self.journal.forget(name)
+            self._lengths.forget(name)
             if name in self.segmenter.names:
                 self.segmenter.remove(name)
 
@@ -252,6 +255,7 @@ class Objects(ABC, Generic[FollowedT]):
                 what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
                 self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}")
         taken = {name: prompt for name, prompt in prompts.items() if name not in refused}
+        self._prompted |= {(name, frame.index) for name in taken}
         self.journal.corrected(frame.index, taken.keys() & set(self.segmenter.names))
         return given, taken
 
@@ -285,11 +289,15 @@ class Objects(ABC, Generic[FollowedT]):
                      None where there was none
 
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
-        is no world of the user's. In the frame of a prompt that made a doubtful mask the object's pose is doubted.
+        is no world of the user's. In the frame of a prompt that made a doubtful mask, or one much
+        longer than before, the object's pose is doubted.
         """
         name = estimate.object
         said = self._doubts.pop((name, frame.index), getattr(self.segmenter, "doubts", {}).get(name, ""))
-        if said:
+        prompted = (name, frame.index) in self._prompted
+        self._prompted.discard((name, frame.index))
+        grown = self._lengths.doubt(name, frame, mask, prompted) * (estimate.T_cam_obj is not None)
+        if said or grown:
             estimate = replace(estimate, confidence=min(estimate.confidence, DOUBTED))
         self._next_map[name] = max(self._next_map.get(name, 0), estimate.map_id + 1)
         T_world_cam = next((T for time_s, T in reversed(self._cameras) if time_s == estimate.time_s), None)
@@ -301,7 +309,7 @@ class Objects(ABC, Generic[FollowedT]):
             few = f": a mask of {pixels} pixels does not start it" * (estimate.reason == NOT_SEEN)
             self._unstarted[name] = estimate.reason + (f": {said}" if said else few)
         reason = self._reason(estimate, frame, mask, given is not None)
-        parts = (reason, said * (estimate.T_cam_obj is not None), self._ignored.get(name, ""), frame.remark)
+        parts = (reason, grown, said * (estimate.T_cam_obj is not None), self._ignored.get(name, ""), frame.remark)
         return replace(estimate, reason="; ".join(filter(None, parts)))
 
     def _reason(self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, mask_given: bool) -> str:

@@ -5,9 +5,7 @@ Deleting a line here takes a mechanism out; ``method.mechanisms = "all but NAME"
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Container, Mapping
-from dataclasses import replace
+from collections.abc import Container
 from functools import partial
 from typing import Any
 
@@ -20,10 +18,8 @@ from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
-from p2p_lib.core.mask_length import doubt_growth, mask_length_m
 from p2p_lib.core.memory import ObjectMemory
-from p2p_lib.core.prompts import Prompt
-from p2p_lib.core.types import DOUBTED, Frame, PoseEstimate
+from p2p_lib.core.types import Frame
 from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.extended.model import JoinableModel
@@ -35,8 +31,6 @@ from p2p_lib.extended.scene import CameraTracker
 from p2p_lib.extended.two_maps import OurTracker, TwoMaps
 from p2p_lib.method import pipeline
 
-#: What masks hold is measured in every so many frames, and of so many the usual length is taken.
-_MEASURED, _LENGTHS = 5, 300
 #: Name to what it does.
 MECHANISMS = {
     # Before a frame: frame_guard.
@@ -116,8 +110,6 @@ class Point2Pose(Savable):
         config = as_config("default" if config is None else config)
         self._made_of: tuple[Any, ...] = camera, config, tracker, detector, segmenter
         self._recogniser: Any = None  # of all objects that are known from memories
-        self._lengths_m: dict[str, deque[float]] = {}  # of what objects' masks held, in some frames
-        self._told: set[tuple[str, int]] = set()  # objects, and frames that came with a prompt of theirs
         super().__init__(*self._made_of, compose(camera, config))
 
     def reset(self) -> None:
@@ -171,35 +163,6 @@ class Point2Pose(Savable):
             self.begin(name)
             self._recogniser = self._recogniser or backends.make_recogniser(self.camera)
             self.objects[name] = Remembered(self.objects[name].own, memory, self._recogniser, frozen)
-
-    def begin(self, name: str) -> None:
-        """Start an object of which nothing is known."""
-        super().begin(name)
-        self._lengths_m[name] = deque(maxlen=_LENGTHS)
-
-    def take_prompts(
-        self, frame: Frame, masks: Mapping[str, np.ndarray | None]
-    ) -> tuple[dict[str, np.ndarray | None], dict[str, Prompt]]:
-        """As in :class:`p2p_lib.core.objects.Objects`."""
-        given, prompts = super().take_prompts(frame, masks)
-        self._told |= {(name, frame.index) for name in prompts}
-        return given, prompts
-
-    def explained(
-        self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, given: np.ndarray | None
-    ) -> PoseEstimate:
-        """As in :class:`p2p_lib.core.objects.Objects`; a correction after which a mask holds much more is doubted."""
-        name, told = estimate.object, (estimate.object, frame.index) in self._told
-        self._told.discard((name, frame.index))
-        before_m = self._lengths_m[name]
-        if mask is not None and (told or frame.index % _MEASURED == 0 or not before_m):
-            length_m = mask_length_m(frame, mask, self.camera)
-            said = doubt_growth(name, frame.index, length_m, np.array(before_m)) if told else ""
-            before_m.extend([length_m] if np.isfinite(length_m) else [])
-            if said and estimate.T_cam_obj is not None:
-                reason = "; ".join(filter(None, (estimate.reason, said)))
-                estimate = replace(estimate, confidence=min(estimate.confidence, DOUBTED), reason=reason)
-        return super().explained(estimate, frame, mask, given)
 
 
 def compose(camera: Camera, config: Config) -> pipeline.Parts:
