@@ -85,8 +85,8 @@ def test_the_label_of_a_doubted_pose_says_so(made, scene):
 def test_an_object_that_is_not_followed_any_more_has_no_label(made, scene):
     obj = made.run.objects["box"]
     row = int(np.flatnonzero(obj.has_pose)[-1])
-    gone = replace(obj, status=np.full(len(obj), "initialising"), reason=np.full(len(obj), NOT_FOLLOWED))
-    gone.T_cam_obj[row] = np.nan
+    words = {"status": np.full(len(obj), "initialising"), "reason": np.full(len(obj), NOT_FOLLOWED)}
+    gone = replace(obj, T_cam_obj=np.full_like(obj.T_cam_obj, np.nan), **words)
     assert scene._label(made.sequence.camera, "box", gone, row) is None
 
 
