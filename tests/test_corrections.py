@@ -119,6 +119,17 @@ def test_the_estimate_says_that_a_correction_takes_in_a_neighbour(late, too_much
     assert not too_much or re.match(start, said[0])
 
 
+def test_an_object_that_is_added_again_is_not_compared_with_the_one_before(opening):
+    sequence = opening("crossing", AT + 3)
+    with Point2Pose(sequence.camera, preset().with_values(FAST)) as method:
+        for index, names in enumerate((["can"], ["can", "box"])):
+            masks = sequence.masks(index)
+            method.add_object("can", mask=np.logical_or.reduce([masks[name] for name in names]))
+            found = method.step(sequence.frame(index))["can"]
+            assert found.confidence == 1 and "as long as before" not in found.reason
+            method.remove_object("can")
+
+
 def test_a_box_around_too_much_is_doubted_on_the_page_and_by_a_check(before, tmp_path):
     """Before a run is made of it; what clicks make of a mask nobody knows before a run."""
     sequence, start, was = before

@@ -80,6 +80,14 @@ def mask_iou(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.count_nonzero(one & other) / max(int(np.count_nonzero(one | other)), 1))
 
 
+def small_parts(mask: np.ndarray, fewest_px: float, connectivity: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) int, the number of each connected part of a mask (H, W) bool, 0 outside; and which have fewer pixels."""
+    _, part, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=connectivity)
+    small = stats[:, cv2.CC_STAT_AREA] < fewest_px
+    small[0] = False
+    return part, small
+
+
 def either(masks: Iterable[np.ndarray | None]) -> np.ndarray:
     """(H, W) bool: what any of some masks holds; None holds nothing."""
     return reduce(np.logical_or, (mask for mask in masks if mask is not None))  # its ufunc would copy all of them first

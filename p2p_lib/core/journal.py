@@ -34,8 +34,9 @@ class Journal:
             if turns := list(self._turns(name, now)):
                 _LOG.info("frame %d: %s %s", now.frame_index, name, ", ".join(turns))
             if _LOG.isEnabledFor(logging.DEBUG):
-                pose = f", {now.inliers} of {now.visible_points} points agree" + ", keyframe" * now.keyframe
-                said = f"{now.status}, confidence {now.confidence:.2f}, map {now.map_id}{pose * (now.confidence > 0)}"
+                said = f"{now.status}, confidence {now.confidence:.2f}, map {now.map_id}"
+                if now.T_cam_obj is not None:
+                    said += f", {now.inliers} of {now.visible_points} points agree" + ", keyframe" * now.keyframe
                 _LOG.debug("frame %d (%.0f ms): %s: %s", now.frame_index, total_ms, name, said)
 
     def _turns(self, name: str, now: PoseEstimate) -> Iterator[str]:

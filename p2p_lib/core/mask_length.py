@@ -8,7 +8,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import doubt
-from p2p_lib.core.types import Frame
+from p2p_lib.core.types import Frame, median_of_known
 
 #: One pixel of a square of this side is looked at.
 CELL_PX = 4
@@ -64,7 +64,7 @@ class UsualLengths:
             return ""
         length_m = mask_length_m(frame, mask, self._camera)
         said = doubt_growth(name, frame.index, length_m, np.array(before_m)) if prompted else ""
-        before_m.extend([length_m] if np.isfinite(length_m) else [])
+        before_m.append(length_m)
         return said
 
 
@@ -73,8 +73,7 @@ def doubt_growth(name: str, frame_index: int, length_m: float, before_m: np.ndar
 
     Returns the warning; empty where there is none.
     """
-    known_m = before_m[np.isfinite(before_m)]
-    factor = length_m / np.median(known_m) if len(known_m) else float("nan")
+    factor = length_m / median_of_known(before_m)
     if not factor > GROWN:
         return ""
     got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"

@@ -65,13 +65,12 @@ class Objects(ABC, Generic[FollowedT]):
         self._ignored: dict[str, str] = {}  # of corrections of the newest frame
         self._prompts: dict[str, Prompt] = {}  # in the frame to come
         self._earlier: dict[str, Frame] = {}  # that prompts are of, where it is not the one to come
-        self._doubts: dict[tuple[str, int], str] = {}  # about masks made of those, by object and frame
+        self._doubts: dict[tuple[str, int], str] = {}  # about masks made of prompts, by object and frame of each
         self._next_map: dict[str, int] = {}  # by object, which no pose of its name has had yet
         self._without: dict[str, int] = {}  # objects without a pose, and the first frame without
         self._unstarted: dict[str, str] = {}  # objects, and why what was selected of them last did not start them
         self._turn, self.closed = RLock(), False
         self._predictor, self.journal, self._lengths = Predictor(), Journal(), UsualLengths(camera)
-        self._prompted: set[tuple[str, int]] = set()  # objects, and frames that came with a prompt of theirs
         self._cameras: deque[tuple[float, np.ndarray | None]] = deque()  # time and T_world_cam of frames, as given
 
     @contextmanager
@@ -247,7 +246,6 @@ class Objects(ABC, Generic[FollowedT]):
         while len(self._cameras) > self.tracker.latency_frames + 1:
             self._cameras.popleft()
         self._prompts, self._earlier = {}, {}
-        self._doubts |= {(name, frame.index): text for name, text in doubts.items() if name not in refused}
         self.refused |= refused
         self._ignored = {}
         for name, error in refused.items():
@@ -255,7 +253,7 @@ class Objects(ABC, Generic[FollowedT]):
                 what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
                 self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}")
         taken = {name: prompt for name, prompt in prompts.items() if name not in refused}
-        self._prompted |= {(name, frame.index) for name in taken}
+        self._doubts |= {(name, frame.index): doubts.get(name, "") for name in taken}
         self.journal.corrected(frame.index, taken.keys() & set(self.segmenter.names))
         return given, taken
 
@@ -289,14 +287,13 @@ class Objects(ABC, Generic[FollowedT]):
                      None where there was none
 
         Where its frame was given with a ``T_world_cam``, its pose is in the world, too; the scene that a tracker finds
-        is no world of the user's. In the frame of a prompt that made a doubtful mask, or one much
-        longer than before, the object's pose is doubted.
+        is no world of the user's. In the frame of a prompt that made a doubtful mask, or one much longer than before,
+        the object's pose is doubted.
         """
         name = estimate.object
-        said = self._doubts.pop((name, frame.index), getattr(self.segmenter, "doubts", {}).get(name, ""))
-        prompted = (name, frame.index) in self._prompted
-        self._prompted.discard((name, frame.index))
-        grown = self._lengths.doubt(name, frame, mask, prompted) * (estimate.T_cam_obj is not None)
+        of_prompt = self._doubts.pop((name, frame.index), None)
+        said = of_prompt or getattr(self.segmenter, "doubts", {}).get(name, "")
+        grown = self._lengths.doubt(name, frame, mask, of_prompt is not None) * (estimate.T_cam_obj is not None)
         if said or grown:
             estimate = replace(estimate, confidence=min(estimate.confidence, DOUBTED))
         self._next_map[name] = max(self._next_map.get(name, 0), estimate.map_id + 1)

@@ -156,6 +156,12 @@ class Rows:
         return type(self)(*(c if about else c.select(rows) if isinstance(c, Rows) else c[rows] for c, about in columns))
 
 
+def median_of_known(values: np.ndarray) -> float:
+    """Of those that are known; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
 def evenly(rows: np.ndarray, most: int) -> np.ndarray:
     """At most ``most`` of the rows (n, ...), evenly spread; of several the first and the last are among them."""
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), max(most, 0))).astype(int)]

@@ -98,13 +98,10 @@ def odd_scene(frames: Iterable[Frame], scale: float) -> tuple[str, str] | None:
     near_m = float(np.quantile(every_m, _NEAR_PART)) if len(every_m) else 1.0
     if _CLOSE_M <= near_m <= _FAR_M:
         return None
-    close = near_m < _CLOSE_M
-    why = (
-        "nearer than most depth cameras measure"
-        if close
-        else f"off by about {100 * depth_noise_m(np.array(near_m)):.0f} cm"
-    )
-    so = "all is fine" if close else "poses are as rough"
+    if near_m < _CLOSE_M:
+        why, so = "nearer than most depth cameras measure", "all is fine"
+    else:
+        why, so = f"off by about {100 * depth_noise_m(np.array(near_m)):.0f} cm", "poses are as rough"
     text = f"the nearest {100 * _NEAR_PART:.0f} % up to {near_m:.2g} m away, {why}"
     return text, f"If it was, {so}; if it was not, {_wrong_scale(near_m, scale)}"
 

@@ -17,7 +17,7 @@ import numpy as np
 from p2p_lib.core import tables
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import P2PError
-from p2p_lib.core.types import DOUBTED
+from p2p_lib.core.types import DOUBTED, median_of_known
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
@@ -25,8 +25,8 @@ from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_view
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
-from p2p_lib.evaluation.suspicions import Suspicion, median_of_known, suspicions
-from p2p_lib.extended.depth_lag import APART
+from p2p_lib.evaluation.suspicions import Suspicion, suspicions
+from p2p_lib.extended.depth_lag import DIFFERENT_MOMENTS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -138,7 +138,7 @@ def consistency(
         obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
         fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, doubted)
-        doubts = tuple(text for text in doubted if _is_about(text, name) and APART not in text)
+        doubts = tuple(text for text in doubted if _is_about(text, name) and DIFFERENT_MOMENTS not in text)
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
         kept_of = masks.get(name), keypoints.get(name)
         evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved, bool(run.info.get("offline")))

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from p2p_lib.core.mask_length import GROWN
-from p2p_lib.core.types import DOUBTED
+from p2p_lib.core.types import DOUBTED, median_of_known
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 
 #: Fewer keypoints in a frame neither carry a pose nor say where the object is.
@@ -33,6 +34,11 @@ _GONE_FRAMES, _GONE_SHARE, _AWAY_SHARE = 30, 0.1, 0.5
 _CHANCE = 2
 #: Stretches of frames that are named.
 _NAMED = 3
+
+
+def contradicted(overlap: Any, on_surface: Any) -> Any:
+    """Whether a silhouette or depth speaks against a pose; what is not known (NaN) does not."""
+    return (overlap < OVERLAP) | (on_surface < ON_SURFACE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +190,7 @@ _RULES = (
         "labels",
         "a sure offline pose that silhouette or depth contradicts",
         0.2,
-        lambda e: (e.overlap < OVERLAP) | (e.on_surface < ON_SURFACE),
+        lambda e: contradicted(e.overlap, e.on_surface),
         lambda e: (e.confidence > DOUBTED) & (np.isfinite(e.overlap) | np.isfinite(e.on_surface)) & e.offline,
     ),
     _Rule(
@@ -210,12 +216,6 @@ def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:
             share = f"in {100 * wrong.sum() / count.sum():.0f} % of the frames"
             found.append(_suspicion(rule.name, f"{rule.text} ({share})", e, wrong, count))
     return tuple(found)
-
-
-def median_of_known(values: np.ndarray) -> float:
-    """Of those that are known; NaN without any."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")
 
 
 def _absent(e: RunEvidence) -> Suspicion | None:

@@ -37,7 +37,7 @@ _MIN_FIT, _MIN_GAIN = 0.3, 0.1
 #: take the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
 _SHORT, _OFF = 0.005, 0.02
 #: How a run says, in its doubts, that it moves depth onto its colour.
-APART = "of different moments while the camera moves"
+DIFFERENT_MOMENTS = "of different moments while the camera moves"
 
 
 class DepthLag:
@@ -54,7 +54,7 @@ class DepthLag:
     @property
     def doubt(self) -> tuple[str, str]:
         """What is wrong with a camera that takes them apart, in words, and what to do."""
-        got = f"{APART}, {self.off_px:.0f} px apart"
+        got = f"{DIFFERENT_MOMENTS}, {self.off_px:.0f} px apart"
         return got, "Depth is moved onto colour from then on; poses are better of a camera that takes both together."
 
     def moved(self, frame: Frame) -> np.ndarray | None:
@@ -99,7 +99,7 @@ def as_the_run_took(sequence: Sequence, i: int, doubts: Iterable[str]) -> Frame:
     doubts  of the run (``run.json``)
     """
     frame, lag = sequence.frame(i), DepthLag()
-    if not i or not any(APART in doubt for doubt in doubts):
+    if not i or not any(DIFFERENT_MOMENTS in doubt for doubt in doubts):
         return frame
     lag.off_px = 1.0  # small offsets count, too
     lag.moved(sequence.frame(i - 1))

@@ -23,7 +23,7 @@ import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
-from p2p_lib.core.image import in_mask, mask_iou
+from p2p_lib.core.image import in_mask, mask_iou, small_parts
 from p2p_lib.core.interfaces import Hint
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
@@ -341,8 +341,6 @@ def _without_flaws(mask: np.ndarray) -> np.ndarray:
     """A mask (H, W) bool without its small parts and holes."""
     flaw = _FLAW * np.count_nonzero(mask)
     for region in (True, False):
-        _, part, stats, _ = cv2.connectedComponentsWithStats((mask == region).astype(np.uint8), connectivity=4)
-        small = stats[:, cv2.CC_STAT_AREA] < flaw
-        small[0] = False
+        part, small = small_parts(mask == region, flaw)
         mask = np.where(small[part], not region, mask)
     return mask

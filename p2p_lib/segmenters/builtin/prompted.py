@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import SegmentationConfig
 from p2p_lib.core.depth import depths_at
-from p2p_lib.core.image import ends_px, nearest_px
+from p2p_lib.core.image import ends_px, nearest_px, small_parts
 from p2p_lib.core.prompts import Prompt, points_in_box
 from p2p_lib.core.types import Frame
 from p2p_lib.segmenters.builtin.cut import cut
@@ -339,11 +338,10 @@ def _parts(region: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def _specks(mask: np.ndarray, clicks_px: np.ndarray) -> np.ndarray:
     """(h, w) bool: the parts of a mask (h, w) bool that are a small share of it and hold no click (K, 2) on it."""
-    _, part, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    small = stats[:, cv2.CC_STAT_AREA] < _SPECK * np.count_nonzero(mask)
+    part, small = small_parts(mask, _SPECK * np.count_nonzero(mask), connectivity=8)
     u, v = nearest_px(clicks_px, mask.shape)
     small[part[v, u]] = False
-    return mask & small[part]
+    return small[part]
 
 
 def _within(patch: Patch, box_px: np.ndarray) -> np.ndarray:
