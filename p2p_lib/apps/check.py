@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from collections.abc import Sequence as SequenceOf
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -23,7 +22,7 @@ from p2p_lib.apps.click import FirstMasks, check_depths, clicked_masks
 from p2p_lib.core.backends import DEFAULT_DETECTOR, make_detector
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, did_you_mean
+from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, did_you_mean, listed
 from p2p_lib.core.findings import Finding, Level
 from p2p_lib.core.mask_length import doubt_growth, mask_length_m
 from p2p_lib.core.options import lengths_m
@@ -203,7 +202,11 @@ def _once(faults: Iterable[tuple[P2PError, str]], looked_at: int) -> Iterator[Fi
         alike.setdefault(re.sub(r"\d+", "N", str(error)), []).append((error, otherwise))
     for (first, otherwise), *others in alike.values():
         names = [Path(getattr(error, "name", "")).name for error, _ in others]
-        more = f"; {len(names)} more like it of the {looked_at} frames looked at: {_listed(names)}" if names else ""
+        more = (
+            f"; {len(names)} more like it of the {looked_at} frames looked at: {listed(names, _LISTED)}"
+            if names
+            else ""
+        )
         yield _unreadable("files", first, otherwise=otherwise, more=more)
 
 
@@ -217,14 +220,9 @@ def _whole(sequence: Sequence) -> tuple[np.ndarray, list[Finding]]:
     lost = {*missing, *torn}
     whole = [i for i in range(len(sequence)) if not lost or not lost & {rgb[i], depth[i]}]
     return np.array(whole, int), [
-        Finding("files", Level.WRONG, f"{what}: {_listed(paths)}", f"{fix} {images.SKIP_BAD}")
+        Finding("files", Level.WRONG, f"{what}: {listed(paths, _LISTED)}", f"{fix} {images.SKIP_BAD}")
         for paths, what, fix in found
     ]
-
-
-def _listed(names: SequenceOf[Path | str]) -> str:
-    more = len(names) - _LISTED
-    return ", ".join(map(str, names[:_LISTED])) + (f" and {more} more" if more > 0 else "")
 
 
 def _readable(sequence: Sequence, i: int) -> Frame | None:

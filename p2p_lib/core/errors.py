@@ -9,7 +9,7 @@ import re
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from difflib import get_close_matches
 
 
@@ -124,6 +124,11 @@ def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     called = {name.lower(): name for name in known if name != word}
     near = get_close_matches(word.lower(), called, n=1)
     return f"Did you mean {prefix}{called[near[0]]}?" if near else ""
+
+
+def listed(words: Sequence[object], most: int) -> str:
+    """The first of them in words, and how many more there are."""
+    return ", ".join(map(str, words[:most])) + f" and {len(words) - most} more" * (len(words) > most)
 
 
 def in_a_line(error: BaseException) -> str:

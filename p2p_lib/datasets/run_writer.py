@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from collections.abc import Sequence as SequenceOf
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from p2p_lib.core.config import Config
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, listed
 from p2p_lib.core.files import append, file_name, read_text, replace_text, save_arrays, writing_alone
 from p2p_lib.core.options import differing
 from p2p_lib.core.types import Frame, PoseEstimate, Status
@@ -357,7 +356,7 @@ def _prompts_alone(info: Mapping[str, Any], other: Mapping[str, Any]) -> str:
         keys = [key for key in (prompt | like) if prompt.get(key) != like.get(key)]
         what = "; ".join(_items_alone(key, prompt.get(key), like.get(key)) for key in keys)
         said.append(f"{prompt['name']!r} in frame {prompt['frame']}: {what}")
-    return _few(said) or "nothing"
+    return listed(said, _FEW) or "nothing"
 
 
 def _items_alone(key: str, mine: Any, theirs: Any) -> str:
@@ -365,12 +364,7 @@ def _items_alone(key: str, mine: Any, theirs: Any) -> str:
     if key not in ("points", "negative") or mine is None:
         return f"no {key}" if mine is None else f"{key} {mine}"
     alone = [f"({x:g}, {y:g})" for x, y in (at for at in mine if at not in (theirs or []))]
-    return f"{key} {_few(alone)}" if alone else f"{len(mine)} {key}"
-
-
-def _few(words: SequenceOf[str]) -> str:
-    """The first of them, and how many more there are."""
-    return ", ".join(words[:_FEW]) + f" and {len(words) - _FEW} more" * (len(words) > _FEW)
+    return f"{key} {listed(alone, _FEW)}" if alone else f"{len(mine)} {key}"
 
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
