@@ -18,7 +18,7 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.depth import in_range
 from p2p_lib.core.errors import BadInput, Doubts, MissingData, P2PError, advised, did_you_mean, doubt
 from p2p_lib.core.memory import ObjectMemory, far_fewer_pixels, load_memories
-from p2p_lib.core.options import MaskSource, RunOptions, lengths_m
+from p2p_lib.core.options import MaskSource, RunOptions, lengths_m, located
 from p2p_lib.core.progress import progress_bar, waiting_for
 from p2p_lib.core.prompts import Prompt, given_masks
 from p2p_lib.core.types import DOUBTED, NOT_SEEN, WITH_POSE, Frame, PoseEstimate, status_text
@@ -356,14 +356,18 @@ def _writer(
         redo_from,
     )
     writer.info["left_out"] = {}
-    writer.info |= described(method, options, [prompt for of_frame in job.prompts.values() for prompt in of_frame])
+    prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
+    writer.info |= described(method, options, prompts, at)
     return writer
 
 
-def described(method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt]) -> dict[str, Any]:
-    """What ``run.json`` says of the parts and words with which a run was made."""
+def described(
+    method: Point2Pose, options: RunOptions, prompts: Iterable[Prompt], sequence: Path | None
+) -> dict[str, Any]:
+    """What ``run.json`` says of the parts and words with which a run was made, on the ``sequence`` in a folder."""
     parts = {"detector": method.detector.name, "segmenter": method.segmenter.name}
-    return {**parts, "prompts": [prompt.as_dict() for prompt in prompts], "options": options.as_dict()}
+    asked = located(options.as_dict(), sequence)
+    return {**parts, "prompts": [prompt.as_dict() for prompt in prompts], "options": asked}
 
 
 def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None:

@@ -204,7 +204,7 @@ class _Tracked:
         # The models of all its objects: any may be added yet.
         how: dict[str, Any] = {"models": find_models(sequence), "if_exists": self.live.if_exists}
         writer = RunWriter(out, sequence, method.config, method.tracker.name, "clicks", objects, **how)
-        writer.info |= described(method, self.options, prompts)
+        writer.info |= described(method, self.options, prompts, sequence.path)
         keeper, stopped = Keeper(writer, method, self.options.save_masks, prompts, self.sizes_m), None
 
         def listen(frame: Frame, estimates: dict[str, PoseEstimate]) -> None:

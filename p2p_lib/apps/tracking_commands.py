@@ -24,7 +24,7 @@ from p2p_lib.apps.command_line import (
     warn,
 )
 from p2p_lib.core.errors import BadInput, P2PError
-from p2p_lib.core.options import RunOptions, differing, lengths_m
+from p2p_lib.core.options import RunOptions, differing, lengths_m, located
 from p2p_lib.core.progress import waiting_for
 
 #: Options that choose the method and its parameters.
@@ -157,7 +157,7 @@ def _check_as_before(folder: Path, out: Path, options: RunOptions) -> None:
             info = read_info(out / one.key) or {"frames": 0}
         except P2PError:  # its row will say why
             continue
-        asked = info.get("options") or {}, one.options.as_dict()
+        asked = info.get("options") or {}, located(one.options.as_dict(), one.folder)
         was, now = differing(*({**of, "skip_bad": None} for of in asked))
         if info["frames"] and now:
             fix = "Ask for the same, or name another --out. Nothing was run, and the table is as it was."

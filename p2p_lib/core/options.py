@@ -25,6 +25,7 @@ from p2p_lib.core.backends import (
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
+from p2p_lib.core.paths import full
 
 
 def pairs(given: Iterable[str], option: str, form: str) -> dict[str, str]:
@@ -205,6 +206,28 @@ class RunOptions:
         """The options that are not as they are by default, as one types them: ``["--stop 60", "--save-masks"]``."""
         given = self.as_dict()
         return [_word(of, given[of.name]) for of in fields(self) if given[of.name] not in (of.default, [])]
+
+
+def located(asked: Mapping[str, Any], sequence: str | Path | None) -> dict[str, Any]:
+    """Options as :meth:`RunOptions.as_dict` gives them, with whole paths, which mean the same from any folder.
+
+    A folder of masks that is inside the ``sequence`` stays the name that it has there.
+    """
+    found = dict(asked)
+    found |= {key: str(full(asked[key])) for key in ("config_file", "prompts") if asked.get(key)}
+    if folder := RunOptions(masks=asked.get("masks") or None).mask_source().folder:
+        inside = sequence is not None and (Path(sequence) / folder).is_dir()
+        found["masks"] = folder if inside else str(full(folder))
+    if models := asked.get("models"):
+        found["models"] = {name: str(full(path)) for name, path in models.items()}
+    if memory := asked.get("memory"):
+        found["memory"] = [_located_memory(given) for given in memory]
+    return found
+
+
+def _located_memory(given: str) -> str:
+    name, equals, path = given.partition("=")
+    return f"{name}={full(path)}" if equals and not Path(given).exists() else str(full(given))
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str]:

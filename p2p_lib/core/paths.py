@@ -13,6 +13,11 @@ PROJECT = Path(__file__).resolve().parents[2]
 PAPER_REPORTED = "paper_reported.json"
 
 
+def full(path: str | Path) -> Path:
+    """The whole path, with links left as they are: datasets are often put together of links."""
+    return Path(os.path.abspath(Path(path).expanduser()))
+
+
 def manifest_dir() -> Path:
     """``data_manifests/`` of the checkout; where there is none, the copy that the wheel installs."""
     local = PROJECT / "data_manifests"

@@ -22,6 +22,7 @@ from pydantic import BaseModel, Field
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.masks import MaskFiles
@@ -132,7 +133,7 @@ def _truth(folder: Path, obj: str, numbers: list[int], listed, info: dict[int, l
 
 
 def _model_places(folder: Path, obj: str) -> tuple[Path, ...]:
-    root, kind = images.full(folder).parent.parent, "_".join(obj.split("_")[:2])
+    root, kind = full(folder).parent.parent, "_".join(obj.split("_")[:2])
     return (folder / "models" / obj, *(root / models / f"{kind}.ply" for models in ("models_eval", "models")))
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.pickles import load_plain
@@ -38,7 +39,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     first = read_meta(meta_files[0])
     camera = camera_for(rgb, first["camMat"], f"{meta_files[0]}: camMat")
     files = ImageSequence(folder, rgb, depth, camera, images.frame_times(folder, rgb))
-    at = images.full(folder)
+    at = full(folder)
     folders = [at.parents[1] / str(where) / at.name for where in ([masks] if masks else MASKS)]
     files = files.with_masks(next((where for where in folders if where.is_dir()), masks), objects=(OBJECT,))
 
@@ -95,5 +96,5 @@ def _models(folder: Path, meta: dict) -> tuple[Path, ...]:
     own, known = folder / "models" / OBJECT, meta.get("objName")
     if not isinstance(known, str) or not re.fullmatch(r"[\w-]+", known):
         return (own,)
-    models = images.full(folder).parents[1] / "models" / known
+    models = full(folder).parents[1] / "models" / known
     return own, models / "textured_simple.obj", models

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,8 @@ from p2p_lib.datasets.masks import MaskFiles, find_masks
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import ObjectTruth
 
+#: Of a SHA-256, enough to tell images from others.
+_DIGITS = 16
 #: What to do without a camera matrix.
 WRITE_K = (
     "Write fx 0 cx / 0 fy cy / 0 0 1 into cam_K.txt, in pixels at the size of the images, as the camera's driver gives "
@@ -119,6 +122,13 @@ class ImageSequence:
         depth_m = raw.astype(np.float32) * np.float32(self.depth_scale)
         depth_m[raw == self.depth_invalid] = 0
         return Frame(i, float(self.times_s[i]), rgb, depth_m)
+
+    def digest(self, i: int) -> str | None:
+        """What tells the two images at frame i from others, by the bytes of their files; None where one is missing."""
+        files = self.rgb[i], self.depth[i]
+        if not all(path.is_file() for path in files):
+            return None
+        return sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:_DIGITS]
 
     def masks(self, i: int) -> dict[str, np.ndarray] | None:
         """The chosen masks at frame i."""

@@ -67,11 +67,6 @@ def first_readable(files: Sequence[Path], read: Callable[[Path], np.ndarray]) ->
     raise BadInput(str(files[0].parent), f"{len(files)} files that cannot be read", "one image that can at least")
 
 
-def full(folder: Path) -> Path:
-    """The folder's whole path, with links left as they are: datasets are often put together of links."""
-    return Path(os.path.abspath(folder))
-
-
 def list_files(folder: Path, suffixes: tuple[str, ...], what: str) -> tuple[Path, ...]:
     """The files of a folder in natural order (2 before 10); at least one, or an error that names the folder."""
     if not folder.is_dir():

@@ -16,6 +16,7 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, listed
 from p2p_lib.core.files import append, file_name, read_text, replace_text, save_arrays, writing_alone
 from p2p_lib.core.options import differing
+from p2p_lib.core.paths import full
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
 from p2p_lib.datasets.images import save_png
@@ -24,12 +25,12 @@ from p2p_lib.datasets.mask_log import FILE as MASK_LOG
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, NOT_FOLLOWED, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
-from p2p_lib.datasets.sequence import SYNTHETIC, Sequence
+from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, check_images, first_image
 
 IfExists = Literal["refuse", "replace", "resume"]
 _ANEW = "--force, in Python if_exists='replace'"
 #: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
-_MAY_DIFFER = {"left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
+_MAY_DIFFER = {"first_image", "left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
 #: So many things of a kind are named, the others counted.
 _FEW = 3
 
@@ -87,10 +88,12 @@ class RunWriter:
         self.earlier, self.complete, self.begun = "", False, False
         self.resumed: Run | None = None
         self._held = ExitStack()
-        synthetic = sequence.name.startswith(SYNTHETIC)
+        # A whole path: the run is read from other folders, where a relative one may be another video's.
+        path = None if sequence.name.startswith(SYNTHETIC) or sequence.path is None else full(sequence.path)
         self.info: dict[str, Any] = {
             "sequence": sequence.name,
-            "path": None if synthetic or sequence.path is None else str(sequence.path),
+            "path": None if path is None else str(path),
+            "first_image": first_image(sequence, start) if path is not None else None,
             "format": sequence.format,
             "camera": asdict(sequence.camera),
             "objects": list(self._estimates),
@@ -101,7 +104,7 @@ class RunWriter:
             "preset": config.preset,
             "seed": config.seed,
             "scene_seed": getattr(sequence, "scene_seed", None),
-            "models": {name: str(_from(sequence.path, path)) for name, path in models.items()},
+            "models": {name: str(_from(sequence.path, file)) for name, file in models.items()},
             "frames": 0,
             "finished": False,
             "stopped_by": None,
@@ -257,6 +260,7 @@ class RunWriter:
             theirs["objects"] = mine["objects"]  # their poses tell
         differ = [key for key in mine if theirs[key] != mine[key] and key not in _MAY_DIFFER]
         if not differ and parameters:
+            check_images(earlier, self._sequence)
             return
         was, now = differing(theirs.get("options") or {}, mine.get("options") or {})
         if "sequence" in differ or "path" in differ:
@@ -372,8 +376,9 @@ def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
 
 
 def _from(folder: Path | None, path: Path) -> Path:
-    """The path as seen from the folder where it lies in there."""
-    return path.relative_to(folder) if folder is not None and path.is_relative_to(folder) else path
+    """The path as seen from the folder where it lies in there, else the whole path."""
+    path, inside = full(path), folder and full(folder)
+    return path.relative_to(inside) if inside is not None and path.is_relative_to(inside) else path
 
 
 def _clear(out: Path, info: Mapping[str, Any]) -> None:

@@ -33,6 +33,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
+from p2p_lib.core.options import located
+from p2p_lib.core.paths import full
 from p2p_lib.core.types import DOUBTED, PoseEstimate, Status
 from p2p_lib.datasets.masks import read_labels
 from p2p_lib.datasets.schema import read_json
@@ -267,9 +269,20 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
 
 
 def read_info(folder: Path) -> dict[str, Any] | None:
-    """What ``run.json`` says; None where there is none, :class:`BadInput` where it is not a run's."""
+    """What ``run.json`` says; None where there is none, :class:`BadInput` where it is not a run's.
+
+    Relative paths, which earlier versions wrote, are as seen from the current folder.
+    """
     path = folder / "run.json"
-    return read_json(path, _Info, "what p2p run wrote").model_dump() if path.exists() else None
+    if not path.exists():
+        return None
+    info = read_json(path, _Info, "what p2p run wrote").model_dump()
+    at = info["path"] and full(info["path"])
+    info["path"] = at and str(at)
+    info["models"] = {
+        name: file if (at and (at / file).is_file()) else str(full(file)) for name, file in info["models"].items()
+    }
+    return info | ({"options": located(info["options"], at)} if info.get("options") else {})
 
 
 def _load_timings(path: Path) -> dict[str, np.ndarray]:

@@ -207,12 +207,33 @@ def reopen(info: Mapping[str, Any]) -> Sequence:
     depth_scale, gaps = asked.get("depth_scale"), bool(asked.get("skip_bad"))
     seed = info["seed"] if info.get("scene_seed") is None else info["scene_seed"]  # of older runs both are the same
     found = open_sequence(info["path"] or info["sequence"], info["format"], depth_scale, seed, gaps=gaps)
+    check_images(info, found)
     was, now = (info.get("camera"), asdict(found.camera))
     if was is not None and was != now:
         k = next((key for key in now if was.get(key) != now[key]), "fx")
         fix = "Its poses and meshes are of the camera that it had: run it again, or give it that camera back."
         doubt(f"camera of {found.name}", f"{k} = {now[k]:g}, and {was.get(k)} when the run was made", fix)
     return found
+
+
+class OtherImages(BadInput):
+    """Images that are not those that a run was made on."""
+
+
+def first_image(sequence: Sequence, start: int) -> str | None:
+    """What tells the images at frame ``start`` from others, for ``run.json``; None where no files are known."""
+    digest = getattr(sequence, "digest", None)
+    return digest(start) if digest is not None else None
+
+
+def check_images(info: Mapping[str, Any], sequence: Sequence) -> None:
+    """:class:`OtherImages` where a sequence does not hold what the run was made on that ``run.json`` tells of."""
+    was, start = info.get("first_image"), info.get("start") or 0
+    now = first_image(sequence, start) if was and start < len(sequence) else None
+    if now and now != was:
+        what, got = f"{sequence.path}: images of frame {start}", f"others ({sequence.frame_names[start]}, sha256 {now})"
+        fix = "Put those back, or run it anew on these: p2p run."
+        raise OtherImages(what, got, f"those that the run of {info['sequence']} was made on (sha256 {was})", fix)
 
 
 def _find(path_or_name: str | Path, format: str | None) -> tuple[Path, str | None]:

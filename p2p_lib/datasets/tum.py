@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from p2p_lib.core.errors import BadInput
+from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, read_K
 
@@ -63,7 +64,7 @@ def _listed(path: Path) -> tuple[np.ndarray, list[Path]]:
 def _K(folder: Path) -> tuple[np.ndarray, str]:
     """The camera matrix and where it is from."""
     path = folder / "cam_K.txt"
-    known = re.search("|".join(KINECTS), images.full(folder).name)
+    known = re.search("|".join(KINECTS), full(folder).name)
     if path.is_file() or known is None:
         return read_K(folder)[:2]
     fx, fy, cx, cy = KINECTS[known[0]]

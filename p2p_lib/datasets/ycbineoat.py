@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import ObjectTruth
@@ -32,7 +33,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
     places, whole = [folder / "gt_mask", folder / "masks"], (folder / "gt_mask").is_dir()
     files = image_files(folder).with_masks(masks, places, (OBJECT,), some_frames=not whole)
-    at = images.full(folder)
+    at = full(folder)
     known = [at.parent / "models" / ycb for begins, ycb in YCB_NAMES.items() if at.name.startswith(begins)]
 
     def read_truth() -> dict[str, ObjectTruth]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import read_array
+from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
 from p2p_lib.datasets.sequence import ObjectTruth
@@ -38,7 +39,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
         poses = {obj: images.read_poses(folder / "annotated_poses" / obj, files.rgb) for obj in objects}
         return {obj: ObjectTruth(T, read_labels(folder, obj, len(T))) for obj, T in poses.items()}
 
-    roots = folder, images.full(folder).parent
+    roots = folder, full(folder).parent
     model_places = {obj: tuple(root / "models" / obj for root in roots) for obj in objects}
     return replace(files, depth_invalid=DEPTH_INVALID, read_truth=read_truth, model_places=model_places)
 

@@ -21,7 +21,7 @@ from p2p_lib.core.types import DOUBTED, median_of_known
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
-from p2p_lib.datasets.sequence import Sequence, reopen
+from p2p_lib.datasets.sequence import OtherImages, Sequence, reopen
 from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_view
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
@@ -125,6 +125,8 @@ def consistency(
     no_images = ""
     try:
         sequence = reopen(run.info) if sequence is None else sequence
+    except OtherImages:
+        raise
     except P2PError as error:
         no_images = str(error)
     # Those of an offline result are its run's.

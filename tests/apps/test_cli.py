@@ -310,6 +310,45 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert contents(out) == before
 
 
+def test_a_run_is_of_its_own_video_from_wherever_it_is_read(sequence, tmp_path, capsys, monkeypatch):
+    """Not of another one that is called alike there; paths that an earlier version wrote are as seen from here."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    shutil.rmtree(sequence / "annotated_poses")  # of what has truth only the run itself is scored
+    shutil.move(sequence, there / "slide")
+    shutil.copytree(there / "slide", here / "slide")
+    image = next((here / "slide/rgb").glob("*0.png"))
+    cv2.imwrite(str(image), cv2.imread(str(image))[::-1])
+    models = "object=slide/models/object/points.xyz"
+    clicks(there, ("object", 0, [[60, 50]]))
+    words = ["--prompts", "prompts.json", "--models", models, "--stop", "3"]
+    monkeypatch.chdir(there)
+    assert run(Path("slide"), Path("out"), *words) == 0
+    kept = json.loads(Path("out/run.json").read_text())
+    assert kept["path"] == str(there / "slide") and kept["options"]["prompts"] == str(there / "prompts.json")
+    assert kept["models"] == {"object": "models/object/points.xyz"}
+    monkeypatch.chdir(here)
+    assert cli.main(["run", "--out", "../there/out", "--resume", "--quiet"]) == 0
+    assert cli.main(["film", "../there/out", "--out", "film.gif"]) == 0
+    old = kept | {"path": "slide", "options": kept["options"] | {"prompts": "prompts.json"}}
+    Path("../there/out/run.json").write_text(json.dumps(old))
+    capsys.readouterr()
+    for command in (
+        ["film", "--out", "other.gif"],
+        ["eval"],
+        ["export", "--format", "tum", "--out", "tum"],
+        ["refine"],
+    ):
+        assert cli.main([command[0], "../there/out", *command[1:]]) == 2, command
+        got = "slide: images of frame 0: got others (0"
+        assert (
+            got in (line := one_line(capsys, command[0])) and "those that the run of slide was made on (sha256 " in line
+        )
+    monkeypatch.chdir(there)
+    assert run(Path("slide"), Path("out"), *words, "--resume") == 0 and "which is finished" in capsys.readouterr().err
+    shutil.copy(here / "slide/rgb" / image.name, there / "slide/rgb")
+    assert run(Path("slide"), Path("out"), *words, "--resume") == 2 and "images of frame 0" in one_line(capsys)
+
+
 def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys, here):
     here()
     (shelf := tmp_path / "shelf").mkdir()
