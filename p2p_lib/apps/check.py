@@ -184,15 +184,15 @@ def _blamed(unit: Finding, findings: list[Finding]) -> list[Finding]:
     return [(first | after).get(id(f), f) for f in findings]
 
 
-def _unreadable(name: str, error: P2PError, fix: str = "", otherwise: str = "", more: str = "") -> Finding:
-    """An error as a finding; ``fix`` in place of its own advice, ``otherwise`` where it has none."""
+def _unreadable(name: str, error: P2PError, otherwise: str = "", more: str = "") -> Finding:
+    """An error as a finding; ``otherwise`` is what to do where it has no advice of its own."""
     if isinstance(error, BadInput):
         text, advice = f"{error.name}: got {error.got}, expected {error.expected}", error.fix
     elif isinstance(error, MissingData):
         text, advice = f"{error.name}: {error.expected}", error.fix
     else:
         text, advice = str(error), ""
-    return Finding(name, Level.WRONG, f"{text}{more}", fix or advice or otherwise)
+    return Finding(name, Level.WRONG, f"{text}{more}", advice.replace(images.SEE_CHECK, "").strip() or otherwise)
 
 
 def _once(faults: Iterable[tuple[P2PError, str]], looked_at: int) -> Iterator[Finding]:
@@ -245,12 +245,12 @@ def _files(folder: Path) -> list[Finding]:
         try:
             return read()
         except P2PError as error:
-            wrong.append(_unreadable(name, error, fix))
+            wrong.append(_unreadable(name, error, otherwise=fix))
 
     def first(part: str, suffixes: tuple[str, ...], read: Callable[[Path], np.ndarray]) -> None:
         files = look(
             f"{part}/",
-            images.called_otherwise(folder / part) or _PUT[part],
+            _PUT[part],
             lambda: images.list_files(folder / part, suffixes, f"{part} images"),
         )
         if files:

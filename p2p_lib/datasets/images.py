@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, wrong_size
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, listed, wrong_size
 from p2p_lib.core.files import LARGEST_IMAGE_PX, UNREADABLE, read_array, read_bytes, read_text, replacing
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -26,6 +27,16 @@ DEFAULT_HZ = 30.0
 _UNDECODED: tuple[type[Exception], ...] = (*UNREADABLE, cv2.error)
 #: What to do about a frame that cannot be read, where nobody can mend it.
 SKIP_BAD = "p2p run --skip-bad goes on without such frames (with --resume where a run was begun)."
+#: What looks at a whole folder; left out where it has just done so.
+SEE_CHECK = "p2p check FOLDER says what else is missing."
+#: What recorders call a folder of images.
+_IMAGES = "([-_]?(images?|maps?|frames?|png|raw|aligned|registered))?"
+_LIKELY = {
+    "rgb": f"(rgb|colou?rs?|images?|frames?){_IMAGES}",
+    "depth": f"((aligned|registered)[-_]?)?depths?{_IMAGES}",
+}
+#: The last bytes of a whole image, and within how many bytes of its end they are: some cameras fill up what follows.
+_END_MARKS = {".png": (b"IEND", 12), ".jpg": (b"\xff\xd9", 1024), ".jpeg": (b"\xff\xd9", 1024)}
 #: Numbers of two images that belong together go on alike, to this share of a step.
 _OUT_OF_STEP = 0.75
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.
@@ -70,18 +81,25 @@ def first_readable(files: Sequence[Path], read: Callable[[Path], np.ndarray]) ->
 def list_files(folder: Path, suffixes: tuple[str, ...], what: str) -> tuple[Path, ...]:
     """The files of a folder in natural order (2 before 10); at least one, or an error that names the folder."""
     if not folder.is_dir():
-        fix = f"{called_otherwise(folder)} p2p check FOLDER says what else is missing.".strip()
+        fix = f"{called_otherwise(folder)} {SEE_CHECK}".strip()
         raise MissingData(str(folder), f"no such folder, expected {what} there", fix)
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+    there = [p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")]
+    files = [p for p in there if p.suffix.lower() in suffixes]
     if not files:
-        raise BadInput(str(folder), "no files", f"{what} ({' '.join(suffixes)})")
+        held = listed([f"{n} of kind {kind or '(none)'}" for kind, n in Counter(p.suffix for p in there).items()], 3)
+        lossy = any(p.suffix.lower() in COLOUR for p in there)
+        meant = "are colour and depth images swapped?" if folder.name == "depth" else "save them as PNG."
+        fix = f"JPEG keeps no exact values: {meant}" if lossy else ""
+        got = f"no files that fit, but {held}" if there else "no files"
+        raise BadInput(str(folder), got, f"{what} ({' '.join(suffixes)})", fix)
     return tuple(sorted(files, key=_natural))
 
 
 def called_otherwise(folder: Path) -> str:
     """What to do where a folder is there under a name that other recorders give it; empty where it is not."""
-    names = {"rgb": ("rgb", "color", "colour", "images"), "depth": ("depth",)}.get(folder.name, (folder.name,))
-    near = [path for path in sorted(folder.parent.glob("*/")) if path.name.lower() in names and path != folder]
+    likely = _LIKELY.get(folder.name, re.escape(folder.name))
+    others = (path for path in sorted(folder.parent.glob("*/")) if path != folder)
+    near = [path for path in others if re.fullmatch(likely, path.name.lower())]
     return f"Rename {near[0].name}/ to {folder.name}/." if near else ""
 
 
@@ -235,11 +253,12 @@ def read_raw_depth(path: Path) -> np.ndarray:
 
 
 def is_cut_off(path: Path) -> bool:
-    """Whether a file is empty, or a PNG without its end, as when it was copied in part; without decoding it."""
+    """Whether a file is empty, or an image without its end, as when it was copied in part; without decoding it."""
+    mark, within = _END_MARKS.get(path.suffix.lower(), (b"", 0))
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - 12, 0))
-        return size == 0 or (path.suffix.lower() == ".png" and b"IEND" not in file.read())
+        file.seek(max(size - within, 0))
+        return size == 0 or mark not in file.read()
 
 
 def check_size(

@@ -14,7 +14,7 @@ from p2p_lib.apps import check, cli
 from p2p_lib.apps.check import check_folder
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import BadInput, Doubt
+from p2p_lib.core.errors import BadInput, Doubt, MissingData
 from p2p_lib.core.findings import Level, as_lines
 from p2p_lib.core.mask_length import mask_length_m
 from p2p_lib.core.prompts import Prompt
@@ -525,6 +525,42 @@ def test_an_image_that_ends_too_early_is_found_wherever_it_is(good, tmp_path, mo
     (wrong,) = alarms(check_folder(tmp_path / "torn"))
     assert wrong.level is Level.WRONG and wrong.text == f"1 of 12 images end too early: {torn}"
     assert "--skip-bad" in wrong.fix
+
+
+def test_a_jpeg_that_ends_too_early_is_found_and_one_that_is_padded_is_whole(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "torn")
+    for path in open_sequence(folder).rgb:
+        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)))
+        path.unlink()
+    whole, torn = open_sequence(folder).rgb[2:4]
+    whole.write_bytes(whole.read_bytes() + bytes(500))
+    torn.write_bytes(torn.read_bytes()[:-500])
+    (wrong,) = alarms(check_folder(folder))
+    assert wrong.text == f"1 of 12 images end too early: {torn}"
+
+
+@pytest.mark.parametrize("name", ["depths", "depth_images", "aligned_depth", "Depth-PNG"])
+def test_check_names_the_likely_folder_and_not_itself(good, tmp_path, name):
+    folder = shutil.copytree(good, tmp_path / "open3d")
+    (folder / "rgb").rename(folder / "color")
+    (folder / "depth").rename(folder / name)
+    (folder / "depth_vis").mkdir()
+    (wrong,) = check_folder(folder)
+    assert "depth: no such folder" in wrong.text and wrong.fix == f"Rename {name}/ to depth/."
+    with pytest.raises(MissingData, match=f"Rename {name}/ to depth/. p2p check FOLDER"):
+        open_sequence(folder)
+
+
+def test_colours_in_the_folder_of_depth_are_said_to_be_there(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "swapped")
+    (folder / "rgb").rename(folder / "colours")
+    (folder / "depth").rename(folder / "rgb")
+    (folder / "depth").mkdir()
+    for path in (folder / "colours").iterdir():
+        cv2.imwrite(str(folder / "depth" / f"{path.stem}.jpg"), cv2.imread(str(path)))
+    (wrong,) = (of for of in check_folder(folder) if of.name == "depth/")
+    assert "got no files that fit, but 6 of kind .jpg" in wrong.text
+    assert "are colour and depth images swapped?" in wrong.fix
 
 
 def test_a_fault_of_every_image_is_said_once(good, tmp_path):
