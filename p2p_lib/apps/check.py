@@ -381,7 +381,12 @@ def _registered(frames: list[Frame], pairs: list[tuple[Frame, Frame]]) -> Findin
     name, found = "registration", misfit(frames)
     if found is None:
         fix = "Be sure that the camera's software aligns them: what is not aligned gives poses that are wrong or lost."
-        return Finding(name, Level.OPTIONAL, "too few edges in depth and colour to tell whether they agree", fix)
+        return Finding(
+            name,
+            Level.OPTIONAL,
+            "too few edges in depth and colour, or too much alike, to tell whether they agree",
+            fix,
+        )
     if found.doubt is not None:
         text, fix = found.doubt
         return Finding(name, Level.WRONG, f"depth is {text}", fix)

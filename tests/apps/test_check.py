@@ -207,6 +207,17 @@ def test_misfit_of_registered_depth_is_none():
     assert misfit(scene(2, 1)).gain < 1.05, "within the tolerance"
 
 
+def test_where_depth_would_fit_in_several_places_none_is_called_its_own():
+    twice = [replace(a, depth_m=np.minimum(a.depth_m, b.depth_m)) for a, b in zip(scene(16), scene(-16), strict=True)]
+    assert misfit(twice) is None
+
+
+def test_a_hand_that_moves_is_not_taken_for_an_offset(shared_data):
+    sequence = open_sequence(shared_data / "real_hand/mug_in_hand")
+    fit = misfit([sequence.frame(i) for i in range(0, 16, 2)])  # those that `p2p run --stop 16` looks at, nearly
+    assert fit is None or fit.doubt is None
+
+
 def test_what_cannot_be_told_is_not_fine(good, monkeypatch):
     monkeypatch.setattr(check, "misfit", lambda *_: None)
     finding = found(good, "registration")
