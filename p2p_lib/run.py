@@ -32,8 +32,8 @@ from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
-from p2p_lib.datasets.run_writer import IfExists, RunWriter
-from p2p_lib.datasets.runs import Run, load_run
+from p2p_lib.datasets.run_writer import IfExists, RunWriter, is_refined, look_into
+from p2p_lib.datasets.runs import OFFLINE, Run, load_run
 from p2p_lib.evaluation.known_size import in_masks_m
 from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, Evaluation, evaluate, model_frames, rate
@@ -105,10 +105,11 @@ def run(
     and is reported in the result.
     """
     options = replace(options or RunOptions(), **changes)
-    doubts = Doubts()
+    doubts, if_exists = Doubts(), if_exists if redo_from is None else "resume"
     with waiting_for("Reading the sequence", progress), noted(doubts):
         job = _prepare(sequence, options, progress)
         sizes_m = lengths_m(options.sizes, job.objects)
+        _check_free(job, Path(out), if_exists)
         _doubt_camera(job)
         tracker = options.tracker
         if tracker == OracleTracker.name:  # which has to know the sequence
@@ -117,9 +118,9 @@ def run(
         recall(method, job.memories, options.frozen)
         for name in [n for n in job.objects if n not in job.memories] if job.masks.every_mask else ():
             method.add_object(name)
-        writer = _writer(job, options, method, out, if_exists if redo_from is None else "resume", redo_from)
+        writer = _writer(job, options, method, out, if_exists, redo_from)
     with writer:
-        _say_what_was_there(writer, say)
+        _say_what_was_there(writer, say, if_exists == "resume")
         if not writer.complete:
             prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
             keeper = Keeper(writer, method, options.save_masks, prompts, sizes_m, doubts=doubts)
@@ -332,15 +333,20 @@ def _chosen(known: Sequence[str], wanted: Sequence[str] | None) -> tuple[str, ..
     return chosen
 
 
+def _check_free(job: _Job, out: Path, if_exists: IfExists) -> None:
+    """:class:`BadInput` where the results would be among what is read, or in the place of what is to stay."""
+    at, masks = job.sequence.path, job.masks.folder
+    read = {"the sequence": [at] if at else [], "the masks": [Path(at or "", masks), Path(masks)] if masks else []}
+    for what, places in read.items():
+        if any(place.is_dir() and place.resolve().is_relative_to(out.resolve()) for place in places):
+            raise BadInput(str(out), f"a folder that holds {what}", "another one for the results")
+    look_into(out, if_exists)
+
+
 def _writer(
     job: _Job, options: RunOptions, method: Point2Pose, out: str | Path, if_exists: IfExists, redo_from: int | None
 ) -> RunWriter:
     """The writer of the run, told all that ``run.json`` says of it."""
-    at, masks = job.sequence.path, job.masks.folder
-    read = {"the sequence": [at] if at else [], "the masks": [Path(at or "", masks), Path(masks)] if masks else []}
-    for what, places in read.items():
-        if any(place.is_dir() and place.resolve().is_relative_to(Path(out).resolve()) for place in places):
-            raise BadInput(str(out), f"a folder that holds {what}", "another one for the results")
     known = find_models(job.sequence) | given_models(options.models or {}, {*job.objects, *job.sequence.truth})
     writer = RunWriter(
         out,
@@ -357,7 +363,7 @@ def _writer(
     )
     writer.info["left_out"] = {}
     prompts = [prompt for of_frame in job.prompts.values() for prompt in of_frame]
-    writer.info |= described(method, options, prompts, at)
+    writer.info |= described(method, options, prompts, job.sequence.path)
     return writer
 
 
@@ -370,14 +376,18 @@ def described(
     return {**parts, "prompts": [prompt.as_dict() for prompt in prompts], "options": asked}
 
 
-def _say_what_was_there(writer: RunWriter, say: Callable[[str], object]) -> None:
+def _say_what_was_there(writer: RunWriter, say: Callable[[str], object], resuming: bool) -> None:
     if writer.complete:
         say(f"{writer.path} holds {writer.earlier}, which is finished.")
     elif writer.resumed:
         kept = "its frames" if writer.redo_from is None else f"its frames before {writer.redo_from}"
-        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared before it goes on.")
+        gone = writer.redo_from is not None and is_refined(writer.path / OFFLINE)
+        then = " What p2p refine made of it goes: make it anew afterwards." * gone
+        say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared before it goes on.{then}")
     elif writer.earlier:
         say(f"{writer.path} held {writer.earlier}, which this one replaces.")
+    elif resuming:
+        say(f"{writer.path} holds no run to go on with: one begins anew.")
 
 
 def _track(job: _Job, keeper: Keeper, skip_bad: bool, progress: bool, say: Callable[[str], object]) -> None:

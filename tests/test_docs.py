@@ -4,6 +4,7 @@ import argparse
 import ast
 import doctest
 import importlib
+import inspect
 import json
 import re
 import subprocess
@@ -22,7 +23,9 @@ from p2p_lib.apps import cli, command_line
 from p2p_lib.benchmark.jobs import jobs_of
 from p2p_lib.benchmark.plan import Plan
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.types import Frame, Status
+from p2p_lib.datasets.cameras import LiveCamera
 from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.sequence import no_truth_said, open_sequence
@@ -173,6 +176,20 @@ def test_the_example_tracker_tracks():
         estimate = method.step(Frame(k, k / 30, rgb, np.full((120, 160), 0.8, np.float32)), {"poster": mask})["poster"]
     assert estimate.status is Status.TRACKED and estimate.inliers >= 20
     np.testing.assert_allclose(estimate.T_cam_obj[:3, :3], np.eye(3), atol=1e-6)
+
+
+@pytest.mark.parametrize("protocol", [Detector, LiveCamera, PointTracker, Segmenter])
+def test_the_calls_that_parts_are_to_have_are_said_with_their_defaults(protocol):
+    """A class that is written by them is one to a type checker."""
+    said = dict(re.findall(r"(?:def |`)(\w+)(\((?:[\w=, ]|\(\))*\))(?::|`)", read("CONTRIBUTING.md")))
+    calls = {key: of for key, of in vars(protocol).items() if inspect.isfunction(of) and not key.startswith("_")}
+    for name, function in calls.items():
+        plain = [f"{p.name}={p.default}" if p.default is not p.empty else p.name for p in parameters(function)]
+        assert said[name].replace("self, ", "").replace("self", "") == f"({', '.join(plain)})", name
+
+
+def parameters(function) -> list[inspect.Parameter]:
+    return list(inspect.signature(function).parameters.values())[1:]
 
 
 def test_the_example_loader_loads(tmp_path, monkeypatch):

@@ -251,7 +251,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _meant(word: str, known: list[str]) -> str:
-    meant = did_you_mean(word, [option for option in known if option != "--force"])  # it replaces an earlier run
+    dashes = "--" if word.startswith("--") else ""  # which all options share, and which make none alike
+    known = [option for option in known if option.startswith(dashes) and option != "--force"]  # it replaces a run
+    meant = did_you_mean(word.removeprefix(dashes), [option.removeprefix(dashes) for option in known], dashes)
     return f". {meant}" if meant else ""
 
 

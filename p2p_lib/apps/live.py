@@ -27,7 +27,7 @@ from p2p_lib.core.compiled import warm_up
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.memory import load_memories
 from p2p_lib.core.options import RunOptions, lengths_m
-from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.prompts import Prompt, doubt_spelling
 from p2p_lib.core.types import Frame, PoseEstimate, status_text
 from p2p_lib.datasets.cameras import DEFAULT_BACKLOG, LiveCamera, Newest, Stream
 from p2p_lib.datasets.models import find_models
@@ -167,7 +167,9 @@ class _Tracked:
             self.live.say(f"{self.camera.name} runs; objects are told on standard input, a line each: {FORM}")
         while frame is not None:
             while self.waiting and self.waiting[0].frame <= (0 if frame is first else frame.index):
-                method.tell(self.waiting.pop(0))
+                if (prompt := self.waiting.pop(0)).name not in method.objects:
+                    doubt_spelling(prompt.name, method.objects)
+                method.tell(prompt)
             self.prompts.extend(words.tell(method, frame) if words else [])
             yield method.step(frame)
             if frame is not first:  # which may be long ago

@@ -12,7 +12,7 @@ from dataclasses import replace
 from urllib.parse import urlsplit
 
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, did_you_mean, in_a_line
-from p2p_lib.core.prompts import Prompt
+from p2p_lib.core.prompts import Prompt, doubt_spelling
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import KEYS, parse_prompts
 from p2p_lib.extended.default import Point2Pose
@@ -65,6 +65,8 @@ class Words:
                 else:
                     then = of if isinstance(of, Frame) else self._kept(prompt) if of else None
                     prompt = replace(prompt, frame=frame.index)
+                    if name not in method.objects:
+                        doubt_spelling(name, method.objects)
                     method.tell(prompt, then)
                     taken.append(prompt)
             except BadInput as error:

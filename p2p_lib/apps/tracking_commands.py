@@ -23,7 +23,7 @@ from p2p_lib.apps.command_line import (
     unscored,
     warn,
 )
-from p2p_lib.core.errors import BadInput, P2PError
+from p2p_lib.core.errors import BadInput, MissingData, P2PError
 from p2p_lib.core.options import RunOptions, differing, lengths_m, located
 from p2p_lib.core.progress import waiting_for
 
@@ -75,6 +75,8 @@ _FORCE = arg("--force", dest="if_exists", action="store_const", const="replace",
 def _run(a: argparse.Namespace) -> int:
     if a.sequence is None and a.batch is None and a.if_exists == "resume":
         a.sequence = _sequence_of(a.out)
+        if a.sequence is None:
+            raise MissingData(str(a.out), "no run there to go on with", "Name its folder, or what to run: p2p run SEQ")
     if (a.sequence is None) == (a.batch is None):
         a.parser.error("needs either SEQ or --batch FOLDER")
     if a.batch is not None and (a.if_exists == "replace" or a.overlay is not None):

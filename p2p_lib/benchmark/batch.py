@@ -99,6 +99,7 @@ def run_batch(
         if path.stem not in done or done[path.stem].status != "failed":
             path.unlink()
     table = DataFrame([row for one in todo for row in _rows(one, out / one.key, done[one.key])])
+    table = table[[*(column for column in table if column != "note"), "note"]]  # whose length pads no other
     with replacing(out / TABLE) as file:
         file.write(table.astype({"frames": "Int64"}).to_csv(index=False).encode())  # whole, though some have none
     return table

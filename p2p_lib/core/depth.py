@@ -41,7 +41,7 @@ def check_metres(frame: Frame) -> None:
         return
     near_m, middle_m = _near_and_middle_m(frame.depth_m)
     what = f"depth of frame {frame.index}"
-    fix = f"{_MILLIMETRES.capitalize()} Give metres (p2p: --depth-scale 0.001)."
+    fix = f"{_MILLIMETRES.capitalize()} Give metres: divide by 1000 (files, in p2p: --depth-scale 0.001)."
     if near_m > _FAR_M:
         raise BadInput(what, f"{near_m:.0f} m and more", f"objects nearer than {_FAR_M:g} m", fix)
     if middle_m > _FAR_M:

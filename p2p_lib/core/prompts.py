@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -107,6 +108,16 @@ def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
     """Refuse a mask of another size than the camera's images; none at all is fine."""
     if mask is not None and mask.shape != (camera.height, camera.width):
         raise wrong_size(f"mask of {name!r}", mask.shape, (camera.height, camera.width), "the camera")
+
+
+def doubt_spelling(name: str, known: Iterable[str]) -> None:
+    """Warn of a new object that is called as one that is known, but for capitals, blanks or underscores."""
+
+    def plain(name: str) -> str:
+        return re.sub(r"[\s_-]", "", name).casefold()
+
+    if like := next((other for other in known if other != name and plain(other) == plain(name)), None):
+        doubt(f"object {name!r}", f"another one than {like!r}, which is known", f"To correct that one, write {like!r}.")
 
 
 def check_apart(others: Iterable[Prompt], prompt: Prompt, where: str = "") -> None:

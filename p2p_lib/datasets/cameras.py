@@ -224,7 +224,7 @@ class Newest:
 
     keep     indices of frames that are not dropped
     backlog  how many others wait behind the next one; where more do the oldest is dropped
-    stop     the index from which on none is read, to push one before it out; ``stopped`` says that it came
+    stop     the index from which on none is read, to push one before it out; ``stopped`` says that it was reached
     """
 
     def __init__(self, source: LiveCamera, keep: Collection[int] = (), backlog: int = 0, stop: float = math.inf):
@@ -261,15 +261,16 @@ class Newest:
     def _grab(self) -> None:
         try:
             while not self._closed and (frame := self._source.read()) is not None:
-                if frame.index >= self._stop:
+                if frame.index < self._stop:
+                    with self._changed:
+                        self._waiting.append(frame)
+                        idle = [waits for waits in self._waiting if waits.index not in self._keep]
+                        if len(idle) > self._most:
+                            self._waiting.remove(idle[0])
+                        self._changed.notify()
+                if frame.index >= self._stop - 1:  # the next one may take for ever
                     self.stopped = True
                     return
-                with self._changed:
-                    self._waiting.append(frame)
-                    idle = [waits for waits in self._waiting if waits.index not in self._keep]
-                    if len(idle) > self._most:
-                        self._waiting.remove(idle[0])
-                    self._changed.notify()
         except BaseException as error:  # noqa: BLE001 - raised where frames are taken
             self._error = error
         finally:

@@ -21,7 +21,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depths_at
 from p2p_lib.core.errors import BadInput, did_you_mean
 from p2p_lib.core.files import file_name, parse_json, read_text, replace_text
-from p2p_lib.core.prompts import Prompt, check_apart, check_prompt
+from p2p_lib.core.prompts import Prompt, check_apart, check_prompt, doubt_spelling
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.images import read_image, save_png
 from p2p_lib.datasets.sequence import Sequence
@@ -131,7 +131,7 @@ def prompts_by_frame(
     says only what is not it.
     """
     found: dict[int, tuple[Prompt, ...]] = {}
-    known = set(started)
+    known = dict.fromkeys(started)
     for prompt in sorted(prompts, key=lambda p: p.frame):
         who = f"prompt of {prompt.name!r}"
         if prompt.frame not in frames:
@@ -144,7 +144,9 @@ def prompts_by_frame(
         if not prompt.starts and prompt.name not in known:
             fix = "Click on it in that frame or before."
             raise BadInput(who, f"nothing on it in frame {prompt.frame}", "a click, a box or a mask first", fix)
-        known.add(prompt.name)
+        if prompt.name not in known:
+            doubt_spelling(prompt.name, known)
+        known[prompt.name] = None
     return found
 
 

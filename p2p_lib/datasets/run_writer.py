@@ -265,6 +265,10 @@ class RunWriter:
         was, now = differing(theirs.get("options") or {}, mine.get("options") or {})
         if "sequence" in differ or "path" in differ:
             was, now = f"{_place(theirs)} {was}".strip(), f"{_place(mine)} {now}".strip()
+        if start is None and (first := self._first_change(mine, theirs, differ)) is not None:
+            fix = (
+                f"Ask for the same, keep the frames before the first change (--from {first}), or run it anew: {_ANEW}."
+            )
         if now:  # what somebody typed; all else follows of it
             raise BadInput(f"{self.path}: the run to go on with", now, f"{was}, as it began", fix)
         if not differ:
@@ -276,6 +280,17 @@ class RunWriter:
             for both in ((mine, theirs), (theirs, mine))
         )
         raise BadInput(f"{self.path}: {', '.join(differ)}", got, f"{expected}, as it began", fix)
+
+    def _first_change(self, mine: Mapping[str, Any], theirs: Mapping[str, Any], differ: Iterable[str]) -> int | None:
+        """The frame from which on another run may be gone on with, where that was told other prompts and no more."""
+        asked, before = ({**(info.get("options") or {}), "prompts": None} for info in (mine, theirs))
+        if self.resumed is None or asked != before or set(differ) - {"options", "prompts", "objects"}:
+            return None
+        told = [info.get("prompts") or [] for info in (mine, theirs)]
+        changed = [prompt["frame"] for prompt in told[0] + told[1] if not all(prompt in of for of in told)]
+        reached = next(iter(self.resumed.objects.values())).frame_index
+        first = min([*changed, int(reached[-1])]) if changed else int(reached[0])
+        return first if first > reached[0] else None
 
     def _compare(self, earlier: Run, k: int) -> None:
         """That the k-th frame came out as it did before."""
@@ -404,12 +419,16 @@ def _unlink(out: Path, patterns: Iterable[str]) -> None:
                 path.unlink()
 
 
+def is_refined(folder: Path) -> bool:
+    """Whether a folder is what ``p2p refine`` made of a run; not one that a link leads to."""
+    return not folder.is_symlink() and bool((read_info(folder) or {}).get("offline"))
+
+
 def _clear_refined(out: Path) -> None:
     """Take away what was refined of a run."""
     refined = out / OFFLINE  # of poses that are gone: it would pass for one of the new run
-    of = None if refined.is_symlink() else read_info(refined)
-    if of is not None and of.get("offline"):
-        _clear(refined, of)
+    if is_refined(refined):
+        _clear(refined, read_info(refined) or {})
         (refined / "run.json").unlink()
         for folder in (refined / "poses", refined / "meshes", refined):
             with suppress(OSError):  # something else is in it

@@ -250,5 +250,6 @@ def _suspicion(rule: str, text: str, e: RunEvidence, wrong: np.ndarray, count: n
     ends = [(int(e.frame_index[at[a]]), int(e.frame_index[at[b - 1]])) for a, b in edges.reshape(-1, 2)]
     longest = sorted(sorted(ends, key=lambda end: end[0] - end[1])[:_NAMED])
     named = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in longest)
-    more = f" and {len(ends) - _NAMED} more stretches" if len(ends) > _NAMED else ""
+    left = len(ends) - _NAMED
+    more = f" and {left} more stretch{'es' * (left > 1)}" if left > 0 else ""
     return Suspicion(rule, f"{text}: frames {named}{more}", tuple(e.frame_index[wrong].tolist()))

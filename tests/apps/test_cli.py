@@ -221,6 +221,11 @@ def test_results_beside_the_data_leave_it_alone(sequence, tmp_path, capsys):
     assert "a: got a folder that holds the masks" in capsys.readouterr().err and (tmp_path / "a" / "masks").is_dir()
 
 
+def test_a_folder_that_is_taken_is_said_before_anything_is_doubted(done, sequence, capsys, monkeypatch):
+    monkeypatch.setattr("p2p_lib.run.moving_scale", lambda pairs: "all depth changes")
+    assert run(sequence, done) == 2 and "go on with it (--resume" in one_line(capsys)
+
+
 NEVER_STARTS = {
     "unknown word": lambda s: ["--tracker", "nope"],
     "bad value": lambda s: ["--set", "sampling.points=0"],
@@ -276,8 +281,8 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
 
     with monkeypatch.context() as patch:
         patch.setattr(Point2Pose, "step", interrupted)
-        assert run(sequence, out, *words) == 130  # where there is nothing yet it begins
-    capsys.readouterr()
+        assert run(sequence, out, *words) == 130
+    assert f"{out} holds no run to go on with: one begins anew." in capsys.readouterr().err
     assert run(sequence, out, *words) == 0
     assert "(5 frames" in (err := capsys.readouterr().err) and "before it goes on" in err
     now, whole = load_run(out), load_run(done)
@@ -290,10 +295,10 @@ def test_a_run_that_was_cut_short_goes_on(sequence, done, tmp_path, capsys, monk
     assert "which is finished" in (err := capsys.readouterr().err) and contents(out) == before and "left out" not in err
     assert cli.main(["run", str(sequence), "--out", str(out), "--resume", "--quiet"]) == 0 and contents(out) == before
     assert cli.main(["run", "--out", str(out), "--resume", "--quiet"]) == 0 and contents(out) == before
-    with pytest.raises(SystemExit):  # nothing says of what
-        cli.main(["run", "--out", str(tmp_path / "none"), "--resume", "--quiet"])
     taken = f"left out, and taken from the run in {out}: --set method.surface=false --set method.graph=false --seed 7"
     assert taken in capsys.readouterr().err.replace("'", "")
+    assert cli.main(["run", "--out", str(tmp_path / "none"), "--resume", "--quiet"]) == 2
+    assert "none: no run there to go on with. Name its folder, or what to run" in one_line(capsys)
     assert run(sequence, out, "--seed", "8", "--resume") == 2
     got = "out: the run to go on with: got --seed 8, expected --seed 7, as it began. Ask for the same, or run it anew"
     assert got in one_line(capsys)
@@ -383,8 +388,13 @@ def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsy
     before = contents(out)
     assert {"poses/gone.txt", "masks/gone/000000.png", "offline/poses.npz"} <= before.keys()
     more = [*prompts(hidden), "--save-masks"]
+    other = shutil.copy(tmp_path / "p.json", tmp_path / "corrected.json")
     for words, said in (
         (["--resume"], "out: prompts: got"),
+        (["--resume"], "Ask for the same, keep the frames before the first change (--from 5), or run it anew"),
+        (["--prompts", str(other), "--resume"], f"expected --prompts {tmp_path / 'p.json'}, as it began. Ask for"),
+        (["--prompts", str(other), "--resume"], "the first change (--from 5)"),
+        (["--prompts", str(other), "--resume", "--seed", "9"], "as it began. Ask for the same, or run it anew"),
         (["--resume", "--from", "6"], "or say --from FRAME of the first change"),
         (["--resume", "--from", "0"], f"from: got frame 0, expected one from 1 to {FRAMES - 1}"),
         (["--resume", "--from", "5", "--seed", "9"], "got --seed 9, expected no --seed, as it began. Ask for the same"),
@@ -407,7 +417,8 @@ def test_a_run_goes_on_from_a_frame_with_other_prompts(sequence, tmp_path, capsy
         assert run(sequence, out, *more, "--resume", "--from", "5") == 2
     assert [path.name for path in sorted((out / "masks").rglob("*.png"))] == [f"{k:06d}.png" for k in range(6)]
     assert not {"keypoints.npz", "masks.npz", "offline/run.json"} & contents(out).keys()
-    assert "its frames before 5 are tracked again" in capsys.readouterr().err
+    assert "its frames before 5 are tracked again" in (err := capsys.readouterr().err)
+    assert "What p2p refine made of it goes: make it anew afterwards." in err
     assert run(sequence, out, *more, "--resume") == run(sequence, anew, *more) == 0
     capsys.readouterr()
     assert contents(out).keys() == contents(anew).keys()
@@ -911,6 +922,7 @@ def test_a_damaged_run_is_named(case, done, tmp_path, capsys):
         (["eval"], "DIR"),
         (["rum", "x"], "Did you mean run?"),
         (["run", "x", "--ouput", "y"], "no option --ouput. Did you mean --out?"),
+        (["live", "--camera", "x", "--quiet"], "no option --quiet. See p2p live --help"),
         (
             ["run", "x", "--out", "y", "--memory", "a.npz", "b.npz"],
             "b.npz. --memory takes one path: give the run's folder",

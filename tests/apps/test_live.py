@@ -739,12 +739,22 @@ def test_objects_are_clicked_on_while_it_runs(tmp_path):
 class Told(list):
     """In the place of a tracker: the prompts that it is told, and the frames that they are of."""
 
+    objects = ("mug",)
+
     def __init__(self):
         self.of = []
 
     def tell(self, prompt, frame):
         self.append(prompt)
         self.of.append(frame)
+
+
+def test_a_word_on_an_object_that_is_called_nearly_as_another_is_doubted():
+    words, told = Words((), print), Told()
+    words.hear('{"name": "Mug", "points": [[60, 50]]}')
+    with pytest.warns(Doubt, match="object 'Mug': another one than 'mug', which is known"):
+        words.tell(told, picture(0))
+    assert [prompt.name for prompt in told] == ["Mug"]
 
 
 def test_clicks_are_of_the_image_that_is_shown(folder):
@@ -1051,6 +1061,15 @@ def test_frames_up_to_the_stop_are_all_counted(folder):
     options = RunOptions(settings=SETTINGS, stop=12)
     count = track_live(camera, PROMPTS, lambda estimate: None, options, LiveOptions(say=said.append))
     assert (count.frames, count.dropped) == (3, 9) and not [line for line in said if "first masks" in line]
+
+
+def test_no_image_is_waited_for_after_the_last_one_before_the_stop(scripted):
+    for k in range(6):
+        scripted.hand.put(picture(k))
+    with Newest(scripted, backlog=9, stop=6) as newest:
+        assert [newest.take().index for _ in range(6)] == list(range(6))
+        newest._thread.join(10)  # the camera has no seventh
+        assert newest.take() is None and newest.stopped
 
 
 def test_what_was_dropped_while_the_first_masks_were_made_is_said(folder):

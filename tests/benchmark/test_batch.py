@@ -46,6 +46,7 @@ def test_a_recording_that_cannot_be_run_is_a_failure_and_the_table_is_there(shel
     assert "1 of 3 recordings could not be run; the table says why." in capsys.readouterr().err
     rows = (tmp_path / "out/batch.csv").read_text().splitlines()
     assert [row.split(",")[2] for row in rows] == ["frames", "", "8", "8"]
+    assert rows[0].endswith(",note"), "the longest one pads no other column"
     shutil.rmtree(shelf / "broken")
     assert cli.main(words) == 0
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, Doubt, MissingData
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame, save_prompts
@@ -78,6 +78,16 @@ def growing(radii_px, hole=None):
     frames = [Frame(k, k / 30, np.zeros((H, W, 3), np.uint8), depth) for k in range(len(radii_px))]
     masks = [None if r is None else {"mug": disc(38, 29, r), "never": disc(-99, 0, 1)} for r in radii_px]
     return SimpleNamespace(frame=frames.__getitem__, masks=masks.__getitem__, name="s")
+
+
+@pytest.mark.parametrize("name", ["Mug", "red mug", "red-Mug", "REDMUG"])
+def test_an_object_that_is_called_nearly_as_another_is_doubted(name):
+    known = "mug" if name == "Mug" else "red_mug"
+    told = [Prompt(known, 0, [[5, 5]]), Prompt("cup", 1, [[9, 9]]), Prompt(name, 2, [[5, 6]])]
+    with pytest.warns(Doubt, match=f"object '{name}': another one than '{known}', which is known. To correct that"):
+        prompts_by_frame(told, range(3), CAMERA)
+    with pytest.warns(Doubt, match="another one than"):
+        prompts_by_frame(told[2:], range(3), CAMERA, started=[known])
 
 
 @pytest.mark.parametrize("clicks", [0, 1, 3])

@@ -113,6 +113,13 @@ def test_stretches_are_named_across_frames_that_do_not_count():
     assert found.text.endswith("(in 40 % of the frames): frames 30 to 50, 80") and found.frames == (30, 40, 50, 80)
 
 
+@pytest.mark.parametrize(("apart", "says"), [(4, " and 1 more stretch"), (5, " and 2 more stretches")])
+def test_stretches_that_are_not_named_are_counted(apart, says):
+    overlap = np.where(ROWS % 10 == 0, 0.9, np.nan)
+    overlap[: 20 * apart : 20] = 0.1
+    assert any(of.text.endswith(says) for of in suspicions(replace(spotless(), overlap=overlap)))
+
+
 def test_what_is_not_known_is_not_held_against_anybody():
     unknown = {f.name for f in fields(RunEvidence)} - {
         "frame_index",

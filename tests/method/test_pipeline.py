@@ -187,7 +187,10 @@ def test_the_configuration_may_be_a_presets_name():
 
 def test_depth_in_millimetres_is_refused_and_a_far_background_doubted():
     frame, _ = film()[0]
-    with pytest.raises(BadInput, match=r"depth of frame 0: got \d+ m and more, expected .* Is it in millimetres\?"):
+    with pytest.raises(
+        BadInput,
+        match=r"depth of frame 0: got \d+ m and more, expected .* Is it in millimetres\? Give metres: divide by 1000",
+    ):
         Point2Pose(CAMERA).step(replace(frame, depth_m=1000 * frame.depth_m))
     depth_m = frame.depth_m.copy()
     depth_m[: len(depth_m) * 6 // 10] = 400.0
