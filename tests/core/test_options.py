@@ -2,13 +2,14 @@
 
 import argparse
 import shlex
-from dataclasses import fields
+from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
 
 from p2p_lib.core.config import preset
 from p2p_lib.core.errors import BadInput
-from p2p_lib.core.options import RunOptions, add_options, differing, names, pairs
+from p2p_lib.core.options import RunOptions, add_options, differing, located, names, pairs
 
 #: What is typed for each field, and what the field is then.
 TYPED = {
@@ -95,3 +96,19 @@ def test_later_wins_over_earlier_in_the_configuration(tmp_path):
     assert options.config() == expected
     assert RunOptions(preset="default", config_file=file).config().preset == "default"
     assert RunOptions(config_file=file).config().seed == 4
+
+
+def test_paths_are_kept_so_that_they_mean_the_same_from_anywhere(tmp_path, monkeypatch):
+    """Names that are no paths stay: of parts, of sources of masks, of a folder of masks inside the sequence."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "video/mine").mkdir(parents=True)
+    (tmp_path / "a=b").mkdir()
+    asked = RunOptions(memory=["mug=maps/mug.npz", "a=b", "maps"], models={"mug": "m.obj"}, config_file=Path("c.toml"))
+    kept = located(replace(asked, masks="mine", prompts="p.json").as_dict(), "video")
+    assert kept["memory"] == [f"mug={tmp_path}/maps/mug.npz", f"{tmp_path}/a=b", f"{tmp_path}/maps"]
+    assert (kept["models"], kept["config_file"]) == ({"mug": f"{tmp_path}/m.obj"}, f"{tmp_path}/c.toml")
+    assert (kept["masks"], kept["prompts"]) == ("mine", f"{tmp_path}/p.json")
+    assert located(kept, "video") == kept
+    for masks, whole in (("other", f"{tmp_path}/other"), ("builtin", "builtin"), ("first", "first"), (None, None)):
+        assert located(replace(asked, masks=masks).as_dict(), "video")["masks"] == whole
+    assert located(RunOptions(tracker="mine:Tracker").as_dict(), None) == RunOptions(tracker="mine:Tracker").as_dict()
