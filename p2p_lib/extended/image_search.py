@@ -89,11 +89,18 @@ class Sighting:
     T_cam_obj  (4, 4)
     share      points of the surface that show less those contradicted, over those that should show
     uv_px      (K, 2) where points were found on the surface in their colour
+    measured   points that were found on the surface, in their colour or not; 0 for few, or in another light
     """
 
     T_cam_obj: np.ndarray
     share: float
     uv_px: np.ndarray
+    measured: int = 0
+
+    @property
+    def alike(self) -> float:
+        """The share of points found on the surface that have their colour; 1 if there are none."""
+        return len(self.uv_px) / self.measured if self.measured else 1.0
 
     def clearly_above(self, other: Sighting) -> bool:
         """Whether more shows than under another pose, by two standard errors of two shares of so many points."""
@@ -219,7 +226,7 @@ class ImageSearch:
         along = axes * np.ptp(centred @ axes.T, axis=0)[:, None]
         poses = np.repeat(found.T_cam_obj[None], 4, 0)
         poses[:, :3, 3] += np.concatenate([along, -along]) @ found.T_cam_obj[:3, :3].T
-        share, _, _ = self._compare(poses, sample, _FINE_M)
+        share, *_ = self._compare(poses, sample, _FINE_M)
         return (share > _ANYWHERE * found.share).sum() < 2
 
     def _polished(self, found: Sighting, sample: SurfaceSample, proposed: np.ndarray | None) -> np.ndarray:
@@ -228,14 +235,14 @@ class ImageSearch:
         about, back = se3.from_rt(np.eye(3), centre), se3.from_rt(np.eye(3), -centre)
         for scale in _POLISH_SCALES:
             poses = T_cam_obj @ about @ se3.exp(scale * _NEARBY) @ back
-            share, _, _ = self._compare(poses, sample, _FINE_M)
+            share, *_ = self._compare(poses, sample, _FINE_M)
             T_cam_obj = poses[(share - _strayed(poses, proposed, sample)).argmax()]
         return se3.orthonormalised(T_cam_obj)
 
     def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The evidence of one pose; None where too little of the surface would show."""
-        (share,), (found,), (uv_px,) = self._compare(T_cam_obj[None], sample, _FINE_M)
-        return Sighting(T_cam_obj, float(share), uv_px[found]) if np.isfinite(share) else None
+        (share,), (found,), (uv_px,), (measured,) = self._compare(T_cam_obj[None], sample, _FINE_M)
+        return Sighting(T_cam_obj, float(share), uv_px[found], int(measured)) if np.isfinite(share) else None
 
     def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """The pose after robust point-to-plane alignment with the points measured at its pixels."""
@@ -249,8 +256,8 @@ class ImageSearch:
 
     def _compare(
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Shares (H,) as in :class:`Sighting`, -inf where unknown, points found (H, M) bool, and pixels (H, M, 2)."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Shares (H,), -inf where unknown; found (H, M) bool; their pixels (H, M, 2); how many are measured (H,)."""
         arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, sample.lab, self._depth_m, self._lab
         return _compare(*arrays, self._lens, self._noise, near_m, _FEWEST * len(sample) / _POINTS)
 
@@ -293,7 +300,7 @@ def _normal_equations(T, p_obj, n_obj, depth_m, lens):
 def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, fewest):
     poses, points = len(T_cam_obj), len(p_obj)
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
-    share, found = np.full(poses, -np.inf), np.zeros((poses, points), np.bool_)
+    share, measured_on, found = np.full(poses, -np.inf), np.zeros(poses, np.int64), np.zeros((poses, points), np.bool_)
     uv_px, lighter = np.full((poses, points, 2), np.nan), np.zeros(points)  # how much lighter, by its logarithm
     for h in range(poses):
         T = T_cam_obj[h]
@@ -338,9 +345,11 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
         if on > 0 and abs(exposure / on) > _EXPOSED:
             agree = 0
             found[h] = False
+        elif on >= fewest:
+            measured_on[h] = on
         if shown >= fewest and shown >= _SHOWN * facing:
             share[h] = (agree - behind) / max(shown + _HIDDEN * hidden, 1.0)
-    return share, found, uv_px
+    return share, found, uv_px, measured_on
 
 
 def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: SurfaceSample) -> np.ndarray:
