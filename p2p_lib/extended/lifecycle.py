@@ -191,7 +191,7 @@ class Lifecycle(Life):
         return replace(
             self,
             status=status,
-            unlike=False,
+            unlike=0,
             lost_frames=lost_frames,
             start_px=mask_px,
             in_sight=in_sight,
