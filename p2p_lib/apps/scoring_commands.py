@@ -26,7 +26,7 @@ from p2p_lib.apps.command_line import (
     warn,
 )
 from p2p_lib.core.errors import BadInput, MissingData, P2PError
-from p2p_lib.core.options import RunOptions, lengths_m, names
+from p2p_lib.core.options import RunOptions, differing, lengths_m, names
 from p2p_lib.offline import NOT_CAUSAL
 
 _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help="smaller true masks are not scored")
@@ -35,7 +35,7 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 @command(
     "eval",
     "score a run against the truth of its sequence; without any, against what the camera saw",
-    arg("run", type=Path, nargs="?", metavar="DIR", help="folder written by p2p run"),
+    arg("runs", type=Path, nargs="*", metavar="DIR", help="folder of p2p run; several of one video are compared"),
     arg(
         "--poses",
         type=Path,
@@ -59,10 +59,14 @@ _MIN_VISIBLE = arg("--min-visible-px", type=int, default=300, metavar="N", help=
 )
 def _eval(a: argparse.Namespace) -> None:
     options = RunOptions.of_arguments(a)
-    if a.run is not None and a.sequence is not None and a.poses is None:
-        a.parser.error(f"DIR and --sequence do not go together: --poses {a.run / 'poses'} --sequence {a.sequence}")
-    if (a.run is None) == (a.poses is None) or (a.poses is None) != (a.sequence is None):
+    if a.runs and a.sequence is not None and a.poses is None:
+        a.parser.error(f"DIR and --sequence do not go together: --poses {a.runs[0] / 'poses'} --sequence {a.sequence}")
+    if bool(a.runs) == (a.poses is not None) or (a.poses is None) != (a.sequence is None):
         a.parser.error("needs either DIR, a run's folder, or --poses with --sequence")
+    if len(a.runs) > 1:
+        _compare(a, options)
+        return
+    a.run = a.runs[0] if a.runs else None
     imported = None
     if a.poses is not None:
         from p2p_lib.run import import_poses
@@ -86,6 +90,26 @@ def _eval(a: argparse.Namespace) -> None:
         _show(evaluate(imported, None, a.align, a.min_visible_px), a.json)
     else:
         _eval_run(a, options)
+
+
+def _compare(a: argparse.Namespace, options: RunOptions) -> None:
+    """Runs of one video: each as alone, what it was asked for otherwise than the first, and how far it is from that."""
+    from p2p_lib.datasets.runs import load_run
+    from p2p_lib.evaluation.apart import apart
+
+    if a.json or a.rows:
+        a.parser.error("--json and --rows are of one DIR")
+    runs = [load_run(folder) for folder in a.runs]
+    moved = {run.path: apart(runs[0], run) for run in runs[1:]}
+    for run in runs:
+        print(run.path)
+        _eval_run(argparse.Namespace(**vars(a) | {"run": run.path}), options)
+        print()
+    for run in runs[1:]:
+        here, there = differing(run.info.get("options") or {}, runs[0].info.get("options") or {})
+        asked = f"{here}, where {runs[0].path} has {there}" if here else f"asked for as {runs[0].path} was"
+        print(f"{run.path}: {asked}")
+        print("".join(f"  {name}: {words}\n" for name, words in moved[run.path].items()), end="")
 
 
 def _eval_run(a: argparse.Namespace, options: RunOptions) -> None:

@@ -117,6 +117,20 @@ def test_eval_prints_a_table_for_people(done, capsys):
     assert not out.startswith("{") and "ADD-S" in out and "Hz" in out and "seed 7" in out
 
 
+def test_eval_compares_runs_of_one_video(done, tmp_path, capsys):
+    other = shutil.copytree(done, tmp_path / "other")
+    info = json.loads((other / "run.json").read_text())
+    info["options"] = (info.get("options") or {}) | {"stop": 3}
+    (other / "run.json").write_text(json.dumps(info))
+    assert cli.main(["eval", str(done), str(other)]) == 0
+    out = capsys.readouterr().out
+    assert out.count("ADD-S AUC [%]") == 2 and f"{other}: --stop 3, where {done} has" in out
+    assert f"object: 0.0° and 0.0 mm apart (medians of {FRAMES} frames" in out
+    with pytest.raises(SystemExit):
+        cli.main(["eval", str(done), str(other), "--json"])
+    assert "--json and --rows are of one DIR" in capsys.readouterr().err
+
+
 def test_eval_of_an_offline_run_says_that_it_is_one(done, tmp_path, capsys):
     refined = shutil.copytree(done, tmp_path / "refined")
     info = json.loads((refined / "run.json").read_text())
