@@ -239,13 +239,17 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         return np.array([vote[c.hypothesis.inliers].mean() if c.hypothesis.support else 0.0 for c in candidates])
 
     def _look_again(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> list[Proposal]:
-        """Candidates for a return, with how much of the surface shows in the image under each, and in its colours."""
+        """Candidates for a return, with how much of the surface shows in the image under each.
+
+        Where points hold the pose, also in its colours: they may be on a side that looks alike.
+        """
         life = known.life
         if not ((life.unconfirmed or life.unlike) and self.shape.knows(known)):
             return candidates
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
         share = [None if s is None or not life.unconfirmed else s.share for s in found]
-        return [replace(c, sighting=s, shown=at) for c, s, at in zip(candidates, share, found, strict=True)]
+        held = [s if c.hypothesis.support >= FIXED_BY else None for c, s in zip(candidates, found, strict=True)]
+        return [replace(c, sighting=s, shown=at) for c, s, at in zip(candidates, share, held, strict=True)]
 
     def _without_slip(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a followed object, or another turn in its place under which clearly more of the surface shows.
