@@ -947,6 +947,8 @@ def test_a_return_whose_surface_has_other_colours_is_doubted_until_as_much_of_it
         lump = settled(begun(method__mechanisms=mechanisms), [2, 4])
         lump.see(turned(4), mask=nobody)
         monkeypatch.setattr(ImageSearch, "at", painted(0.7))
+        alone = lump.see(turned(4), unseen).estimate
+        assert alone.T_cam_obj is not None and "0 points agree" in alone.reason, "that is doubt enough"
         steps = [lump.see(turned(4)).estimate for _ in range(12)]
         assert {step.status is Status.DEGRADED for step in steps} == {doubted}
         assert not doubted or all("other colours" in s.reason and s.confidence <= 0.5 and not s.keyframe for s in steps)
