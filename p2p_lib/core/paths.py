@@ -13,6 +13,11 @@ PROJECT = Path(__file__).resolve().parents[2]
 PAPER_REPORTED = "paper_reported.json"
 
 
+def seen_from(folder: str | Path, path: str | Path) -> str:
+    """A path as seen from a folder, by which it is found where both were moved together."""
+    return os.path.relpath(full(path), full(folder))
+
+
 def full(path: str | Path) -> Path:
     """The whole path, with links left as they are: datasets are often put together of links."""
     return Path(os.path.abspath(Path(path).expanduser()))

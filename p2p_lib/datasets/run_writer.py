@@ -16,7 +16,7 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, listed
 from p2p_lib.core.files import append, file_name, read_text, replace_text, save_arrays, writing_alone
 from p2p_lib.core.options import differing
-from p2p_lib.core.paths import full
+from p2p_lib.core.paths import full, seen_from
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
 from p2p_lib.datasets.images import save_png
@@ -30,7 +30,8 @@ from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, check_images, first_i
 IfExists = Literal["refuse", "replace", "resume"]
 _ANEW = "--force, in Python if_exists='replace'"
 #: What of ``run.json`` may be otherwise when a run is resumed: how far it came, and what made it, which poses tell.
-_MAY_DIFFER = {"first_image", "left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
+_MAY_DIFFER = {"left_out", "frames", "finished", "stopped_by", "versions", "commit", "modified"}
+_MAY_DIFFER |= {"first_image", "path_from_run"}  # which are there to find and to know the images again
 #: So many things of a kind are named, the others counted.
 _FEW = 3
 
@@ -93,6 +94,7 @@ class RunWriter:
         self.info: dict[str, Any] = {
             "sequence": sequence.name,
             "path": None if path is None else str(path),
+            "path_from_run": None if path is None else seen_from(out, path),
             "first_image": first_image(sequence, start) if path is not None else None,
             "format": sequence.format,
             "camera": asdict(sequence.camera),

@@ -271,13 +271,16 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
 def read_info(folder: Path) -> dict[str, Any] | None:
     """What ``run.json`` says; None where there is none, :class:`BadInput` where it is not a run's.
 
-    Relative paths, which earlier versions wrote, are as seen from the current folder.
+    Relative paths, which earlier versions wrote, are as seen from the current folder. A sequence that is not where it
+    was any more is looked for where it was as seen from the run.
     """
     path = folder / "run.json"
     if not path.exists():
         return None
     info = read_json(path, _Info, "what p2p run wrote").model_dump()
     at = info["path"] and full(info["path"])
+    if at and not at.exists() and (moved := folder / (info.get("path_from_run") or at)).exists():
+        at = full(moved)
     info["path"] = at and str(at)
     info["models"] = {
         name: file if (at and (at / file).is_file()) else str(full(file)) for name, file in info["models"].items()

@@ -33,6 +33,7 @@ from p2p_lib.core.config import Config, from_toml
 from p2p_lib.core.errors import MissingData
 from p2p_lib.core.files import load_arrays, replace_text, save_arrays, writing_alone
 from p2p_lib.core.mesh import save
+from p2p_lib.core.paths import seen_from
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
@@ -235,9 +236,12 @@ def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
             shutil.copyfile(made.run.path / file_name, new / file_name)
     if (parts / "meshes").is_dir():
         shutil.copytree(parts / "meshes", new / "meshes")
+    there = made.run.path / OFFLINE
     about = {"offline": True, **stamp, "masks_in": "..", "disagrees_above_3_sigma": disagrees}
+    if made.run.info["path"]:
+        about["path_from_run"] = seen_from(there, made.run.info["path"])
     replace_text(new / "run.json", json.dumps(made.run.info | about, indent=1, ensure_ascii=False) + "\n")
-    if (there := made.run.path / OFFLINE).exists():
+    if there.exists():
         shutil.rmtree(parts / "before", ignore_errors=True)
         there.rename(parts / "before")
     new.rename(there)

@@ -368,6 +368,21 @@ def test_a_run_is_of_its_own_video_from_wherever_it_is_read(sequence, tmp_path, 
     assert run(Path("slide"), Path("out"), *words, "--resume") == 2 and "images of frame 0" in one_line(capsys)
 
 
+def test_a_run_that_was_moved_with_its_video_still_finds_it(sequence, tmp_path, monkeypatch, capsys):
+    (tmp_path / "project").mkdir()
+    shutil.move(sequence, tmp_path / "project/slide")
+    monkeypatch.chdir(tmp_path)
+    assert run(Path("project/slide"), Path("project/runs/out"), "--stop", "3") == 0
+    shutil.move("project", "elsewhere")
+    assert cli.main(["refine", "elsewhere/runs/out", "--quiet"]) == 0
+    for of in ("out", "out/offline"):
+        assert cli.main(["film", f"elsewhere/runs/{of}", "--out", f"{Path(of).name}.gif"]) == 0
+    shutil.move("elsewhere/slide", "gone")
+    capsys.readouterr()
+    assert cli.main(["film", "elsewhere/runs/out", "--out", "again.gif"]) == 2
+    assert str(tmp_path / "project/slide") in one_line(capsys, "film")
+
+
 def test_a_batch_in_other_words_is_refused_and_its_table_stays(sequence, tmp_path, capsys, here):
     here()
     (shelf := tmp_path / "shelf").mkdir()
