@@ -176,12 +176,25 @@ _KINDS = dict.fromkeys(("frame_index", "visible_points", "inliers", "map_id", "j
 _KINDS |= {"keyframe": "b", "labelled": "b", "status": "U", "reason": "U"}
 
 
+class _Options(BaseModel):
+    """Of what was asked for, that which has paths."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+    config_file: str | None = None
+    prompts: str | None = None
+    masks: str | None = None
+    models: dict[str, str] | None = None
+    memory: list[str] | None = None
+
+
 class _Info(BaseModel):
     """What ``run.json`` says at least, by which a folder is known to be a run's."""
 
     model_config = ConfigDict(extra="allow", strict=True)
     sequence: str
     path: str | None
+    path_from_run: str | None = None
+    options: _Options | None = None
     format: str
     objects: list[Annotated[str, AfterValidator(lambda name: file_name("object name", name))]]
     tracker: str
@@ -277,7 +290,7 @@ def read_info(folder: Path) -> dict[str, Any] | None:
     path = folder / "run.json"
     if not path.exists():
         return None
-    info = read_json(path, _Info, "what p2p run wrote").model_dump()
+    info = read_json(path, _Info, "what p2p run wrote").model_dump(exclude_unset=True)
     at = info["path"] and full(info["path"])
     if at and not at.exists() and (moved := folder / (info.get("path_from_run") or at)).exists():
         at = full(moved)
