@@ -32,7 +32,7 @@ from p2p_lib.datasets.images import SKIP_BAD
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.models import find_models, given_models
 from p2p_lib.datasets.prompts import first_prompts, load_prompts, prompts_by_frame
-from p2p_lib.datasets.run_writer import IfExists, RunWriter, is_refined, look_into
+from p2p_lib.datasets.run_writer import IfExists, RunWriter, look_into, refined_info
 from p2p_lib.datasets.runs import OFFLINE, Run, load_run
 from p2p_lib.evaluation.known_size import in_masks_m
 from p2p_lib.evaluation.oracle import OracleTracker
@@ -381,7 +381,7 @@ def _say_what_was_there(writer: RunWriter, say: Callable[[str], object], resumin
         say(f"{writer.path} holds {writer.earlier}, which is finished.")
     elif writer.resumed:
         kept = "its frames" if writer.redo_from is None else f"its frames before {writer.redo_from}"
-        gone = writer.redo_from is not None and is_refined(writer.path / OFFLINE)
+        gone = writer.redo_from is not None and refined_info(writer.path / OFFLINE) is not None
         then = " What p2p refine made of it goes: make it anew afterwards." * gone
         say(f"{writer.path} holds {writer.earlier}; {kept} are tracked again and compared before it goes on.{then}")
     elif writer.earlier:

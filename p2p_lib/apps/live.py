@@ -167,8 +167,8 @@ class _Tracked:
             self.live.say(f"{self.camera.name} runs; objects are told on standard input, a line each: {FORM}")
         while frame is not None:
             while self.waiting and self.waiting[0].frame <= (0 if frame is first else frame.index):
-                if (prompt := self.waiting.pop(0)).name not in method.objects:
-                    doubt_spelling(prompt.name, method.objects)
+                prompt = self.waiting.pop(0)
+                doubt_spelling(prompt.name, method.objects)
                 method.tell(prompt)
             self.prompts.extend(words.tell(method, frame) if words else [])
             yield method.step(frame)

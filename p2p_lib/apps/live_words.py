@@ -65,8 +65,7 @@ class Words:
                 else:
                     then = of if isinstance(of, Frame) else self._kept(prompt) if of else None
                     prompt = replace(prompt, frame=frame.index)
-                    if name not in method.objects:
-                        doubt_spelling(name, method.objects)
+                    doubt_spelling(name, method.objects)
                     method.tell(prompt, then)
                     taken.append(prompt)
             except BadInput as error:

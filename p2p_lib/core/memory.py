@@ -18,6 +18,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.files import check_arrays, file_name, load_arrays, of_shape, parse_json, read_text, save_arrays
+from p2p_lib.core.paths import named_path
 
 #: Of the files that this library writes, and reads.
 VERSION = 3
@@ -273,9 +274,9 @@ def load_memories(paths: Sequence[str | Path]) -> dict[str, ObjectMemory]:
 
 def _named(given: str | Path) -> list[tuple[Path, str | None]]:
     """The files that are given as a path or as ``NAME=PATH``, each with its name if it is to have another one."""
-    name, equals, path = str(given).partition("=")
-    if not equals or Path(given).exists():
-        return [(file, None) for file in _files(Path(given))]
+    name, path = named_path(given)
+    if name is None:
+        return [(file, None) for file in _files(Path(path))]
     if not path:
         raise BadInput("memory", repr(given), "NAME=PATH, or a path")
     if len(files := _files(Path(path))) > 1:

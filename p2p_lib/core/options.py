@@ -25,7 +25,7 @@ from p2p_lib.core.backends import (
 from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import PointTracker
-from p2p_lib.core.paths import full
+from p2p_lib.core.paths import full, named_path
 
 
 def pairs(given: Iterable[str], option: str, form: str) -> dict[str, str]:
@@ -221,13 +221,9 @@ def located(asked: Mapping[str, Any], sequence: str | Path | None) -> dict[str, 
     if models := asked.get("models"):
         found["models"] = {name: str(full(path)) for name, path in models.items()}
     if memory := asked.get("memory"):
-        found["memory"] = [_located_memory(given) for given in memory]
+        named = [named_path(given) for given in memory]
+        found["memory"] = [f"{name}={full(path)}" if name is not None else str(full(path)) for name, path in named]
     return found
-
-
-def _located_memory(given: str) -> str:
-    name, equals, path = given.partition("=")
-    return f"{name}={full(path)}" if equals and not Path(given).exists() else str(full(given))
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, str]:

@@ -18,6 +18,12 @@ def seen_from(folder: str | Path, path: str | Path) -> str:
     return os.path.relpath(full(path), full(folder))
 
 
+def named_path(given: str | Path) -> tuple[str | None, str]:
+    """NAME and PATH of ``NAME=PATH``; None and the whole of what is a path itself."""
+    name, equals, path = str(given).partition("=")
+    return (name, path) if equals and not Path(given).exists() else (None, str(given))
+
+
 def full(path: str | Path) -> Path:
     """The whole path, with links left as they are: datasets are often put together of links."""
     return Path(os.path.abspath(Path(path).expanduser()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -110,13 +110,14 @@ def check_mask(name: str, mask: np.ndarray | None, camera: Camera) -> None:
         raise wrong_size(f"mask of {name!r}", mask.shape, (camera.height, camera.width), "the camera")
 
 
-def doubt_spelling(name: str, known: Iterable[str]) -> None:
-    """Warn of a new object that is called as one that is known, but for capitals, blanks or underscores."""
+def doubt_spelling(name: str, known: Collection[str]) -> None:
+    """Warn of an object that is not ``known`` but called as one that is, but for capitals, blanks or underscores."""
 
     def plain(name: str) -> str:
         return re.sub(r"[\s_-]", "", name).casefold()
 
-    if like := next((other for other in known if other != name and plain(other) == plain(name)), None):
+    called = {plain(other): other for other in known}
+    if (like := called.get(plain(name))) and name not in known:
         doubt(f"object {name!r}", f"another one than {like!r}, which is known", f"To correct that one, write {like!r}.")
 
 

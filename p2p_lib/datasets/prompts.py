@@ -144,8 +144,7 @@ def prompts_by_frame(
         if not prompt.starts and prompt.name not in known:
             fix = "Click on it in that frame or before."
             raise BadInput(who, f"nothing on it in frame {prompt.frame}", "a click, a box or a mask first", fix)
-        if prompt.name not in known:
-            doubt_spelling(prompt.name, known)
+        doubt_spelling(prompt.name, known)
         known[prompt.name] = None
     return found
 

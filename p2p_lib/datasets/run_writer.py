@@ -421,16 +421,17 @@ def _unlink(out: Path, patterns: Iterable[str]) -> None:
                 path.unlink()
 
 
-def is_refined(folder: Path) -> bool:
-    """Whether a folder is what ``p2p refine`` made of a run; not one that a link leads to."""
-    return not folder.is_symlink() and bool((read_info(folder) or {}).get("offline"))
+def refined_info(folder: Path) -> dict[str, Any] | None:
+    """What ``run.json`` says of what ``p2p refine`` made, not of what a link leads to; else None."""
+    info = None if folder.is_symlink() else read_info(folder)
+    return info if info is not None and info.get("offline") else None
 
 
 def _clear_refined(out: Path) -> None:
     """Take away what was refined of a run."""
     refined = out / OFFLINE  # of poses that are gone: it would pass for one of the new run
-    if is_refined(refined):
-        _clear(refined, read_info(refined) or {})
+    if (info := refined_info(refined)) is not None:
+        _clear(refined, info)
         (refined / "run.json").unlink()
         for folder in (refined / "poses", refined / "meshes", refined):
             with suppress(OSError):  # something else is in it

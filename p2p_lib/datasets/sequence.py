@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData, doubt
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.plugins import find, offered
 from p2p_lib.core.types import Frame
@@ -214,6 +214,16 @@ def reopen(info: Mapping[str, Any]) -> Sequence:
         fix = "Its poses and meshes are of the camera that it had: run it again, or give it that camera back."
         doubt(f"camera of {found.name}", f"{k} = {now[k]:g}, and {was.get(k)} when the run was made", fix)
     return found
+
+
+def reopen_if_there(info: Mapping[str, Any]) -> tuple[Sequence | None, str]:
+    """As :func:`reopen`, or None and why; :class:`OtherImages` is raised, for they would tell of another video."""
+    try:
+        return reopen(info), ""
+    except OtherImages:
+        raise
+    except P2PError as error:
+        return None, str(error)
 
 
 class OtherImages(BadInput):

@@ -14,12 +14,12 @@ def apart(one: Run, other: Run) -> dict[str, str]:
 
     Medians of the frames that both have a pose in; object frames are aligned at the first of these.
     """
-    for what, of in (("sequence", lambda run: [run.info["sequence"]]), ("objects", lambda run: list(run.objects))):
-        mine, its = of(one), of(other)
-        if not set(mine) & set(its):
-            fix = "Runs of one video are compared; others are scored one by one."
-            raise BadInput(f"{other.path}: {what}", ", ".join(its), f"as in {one.path}: {', '.join(mine)}", fix)
-    return {name: _apart(one.objects[name], other.objects[name]) for name in one.objects if name in other.objects}
+    both = [name for name in one.objects if name in other.objects]
+    if one.info["sequence"] != other.info["sequence"] or not both:
+        got, expected = (f"{', '.join(run.objects)} in {run.info['sequence']}" for run in (other, one))
+        fix = "Others are scored one by one."
+        raise BadInput(str(other.path), got, f"objects and sequence of {one.path}: {expected}", fix)
+    return {name: _apart(one.objects[name], other.objects[name]) for name in both}
 
 
 def _apart(a: ObjectRun, b: ObjectRun) -> str:

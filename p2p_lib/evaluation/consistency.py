@@ -16,12 +16,11 @@ import numpy as np
 
 from p2p_lib.core import tables
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import P2PError
 from p2p_lib.core.types import DOUBTED, median_of_known
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
-from p2p_lib.datasets.sequence import OtherImages, Sequence, reopen
+from p2p_lib.datasets.sequence import Sequence, reopen_if_there
 from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_view
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
@@ -123,12 +122,8 @@ def consistency(
     known_m   how long objects are known to be: what was measured is compared with it
     """
     no_images = ""
-    try:
-        sequence = reopen(run.info) if sequence is None else sequence
-    except OtherImages:
-        raise
-    except P2PError as error:
-        no_images = str(error)
+    if sequence is None:
+        sequence, no_images = reopen_if_there(run.info)
     # Those of an offline result are its run's.
     keypoints = load_keypoints(run.path / run.info.get("masks_in", ""))
     masks, every = load_masks(run.path), load_run(run.path, every_map=True)

@@ -17,7 +17,7 @@ from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.models import read_mesh
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
-from p2p_lib.datasets.sequence import LIVE, OtherImages, Sequence, reopen
+from p2p_lib.datasets.sequence import LIVE, Sequence, reopen, reopen_if_there
 from p2p_lib.evaluation.evidence import drawn_m
 from p2p_lib.evaluation.protocol import Evaluation, evaluate
 from p2p_lib.extended.depth_lag import as_the_run_took
@@ -48,12 +48,7 @@ class Playback:
         """Of a run's folder; the sequence is opened as the run says unless it is given."""
         run = run if isinstance(run, Run) else load_run(run)
         if sequence is None:
-            try:
-                sequence = reopen(run.info)
-            except OtherImages:
-                raise
-            except P2PError:
-                pass  # said where images are needed
+            sequence, _ = reopen_if_there(run.info)  # why there are none is said where they are needed
         return cls(run, sequence, load_keypoints(run.path))
 
     @property
