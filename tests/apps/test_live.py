@@ -757,6 +757,16 @@ def test_a_word_on_an_object_that_is_called_nearly_as_another_is_doubted():
     assert [prompt.name for prompt in told] == ["Mug"]
 
 
+def test_a_prompt_of_an_object_that_is_called_nearly_as_another_is_doubted(scripted, folder):
+    sequence = open_sequence(folder)
+    for k in range(2):
+        scripted.hand.put(sequence.frame(k))
+    scripted.hand.put(None)
+    corrects = Prompt("Board", 1, [[64, 52]])
+    with pytest.warns(Doubt, match="object 'Board': another one than 'board', which is known"):
+        track_live(scripted, [*PROMPTS, corrects], lambda estimate: None, RunOptions(settings=SETTINGS))
+
+
 def test_clicks_are_of_the_image_that_is_shown(folder):
     """Seconds later: the mask that was shown starts the object where nothing moved, and nothing where something has."""
     sequence, told = open_sequence(folder), Told()
