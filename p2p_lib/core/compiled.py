@@ -33,7 +33,11 @@ LOOPS = (
     "p2p_lib.extended.image_search",
     "p2p_lib.core.robust",
 )
-LOOPS_IN_BACKGROUND = ("p2p_lib.trackers.builtin.rigid_motion", "p2p_lib.method.refinement")
+LOOPS_IN_BACKGROUND = (
+    "p2p_lib.trackers.builtin.rigid_motion",
+    "p2p_lib.method.refinement",
+    "p2p_lib.trackers.builtin.direct_alignment",
+)
 _waiting: dict[str, list[Callable]] = {}
 _arguments: dict[tuple[str, str], tuple[str, ...]] = {}  # (module, function) to the types it is called with
 _warm: set[str] = set()

@@ -146,6 +146,13 @@ class TrackingConfig(_Checked):
     segment_min_points: int = _p(3, "A segment's pose needs so many points, its start twice as many.", "points", low=3)
     segment_reach_m: float = _p(0.04, "Points nearer to each other than this start in one segment.", "m", low=1e-3)
     segment_inlier_m: float = _p(0.008, "Pairs with a smaller residual agree with a motion.", "m", low=1e-4)
+    overruled_below: float = _p(
+        0.9,
+        "A motion by all colours and depth of a segment counts where it fits them this much better than its points'; "
+        "0: never.",
+        low=0,
+        high=1,
+    )
     split_points: int = _p(8, "So many points that leave a segment together make another one.", "points", low=3)
     split_m: float = _p(0.02, "They do so when they are this far from their segment's motion.", "m", low=1e-3)
     redetect_every: int = _p(2, "Lost segments are searched for everywhere every so many frames.", "frames", low=1)

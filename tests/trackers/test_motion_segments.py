@@ -1,5 +1,7 @@
 """Rigid motion segments on made-up points: start, fit, split, loss, rejection, and positions that improve."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,7 +110,7 @@ def half_lost(
     monkeypatch, shift_px: float, pairs: int, followed: int = 8
 ) -> tuple[Points, motion_segments.MotionSegments]:
     """So many of 25 points are followed, where they were; so many corners of the frame before match, moved."""
-    p, segments = started(RIGHT, image())
+    p, segments = started(RIGHT, image(), replace(TrackingConfig(), overruled_below=0))
     segments.remember(p, image(), None)
     p.verified[followed:] = False
     T_cam_seg = segments.segments[0].fit.T_cam_seg.copy()

@@ -8,7 +8,9 @@ from the poses of these segments. A frame goes through it in this order (:mod:`p
    appearance changed coasts on Lucas-Kanade alone for a few frames.
 2. Fit (``motion_segments``, ``rigid_motion``): each segment's pose is fitted to its points; points that disagree are
    not verified, and many that leave together become a segment of their own. A segment that few points were followed
-   on, in a fast turn or blur, is matched with the frame in which it was seen last (``wide_baseline``).
+   on, in a fast turn or blur, is matched with the frame in which it was seen last (``wide_baseline``). Points that
+   slide agree with each other: the colours and the depth of all that shows of a segment overrule them where they say
+   clearly otherwise (``direct_alignment``).
 3. Search (``landmarks``, ``features``): a lost segment is searched for in the whole image by corners that were seen on
    it, described on its surface (``tangent_planes``); most matches that agree propose its pose.
 4. Find: points that were not followed are searched for where their segment predicts them.

@@ -21,6 +21,7 @@ class Image:
 
     gray     (H, W) uint8; fine and coarse: the same and half as large, float32
     chroma   (H/4, W/4, 2) float32, CIELAB a and b
+    half     (H/2, W/2, 3) uint8, of every other row and column, smoothed
     depth_m  (H, W), 0 where not measured
     """
 
@@ -28,6 +29,7 @@ class Image:
     fine: np.ndarray
     coarse: np.ndarray
     chroma: np.ndarray
+    half: np.ndarray
     depth_m: np.ndarray
     camera: Camera
 
@@ -38,7 +40,7 @@ class Image:
         quarter = cv2.resize(frame.rgb, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
         chroma = cv2.cvtColor(quarter, cv2.COLOR_RGB2LAB)[..., 1:].astype(np.float32)
         fine, coarse = gray.astype(np.float32), cv2.pyrDown(gray).astype(np.float32)
-        return cls(gray, fine, coarse, chroma, frame.depth_m, camera)
+        return cls(gray, fine, coarse, chroma, cv2.pyrDown(frame.rgb), frame.depth_m, camera)
 
     def chroma_at(self, uv_px: np.ndarray) -> np.ndarray:
         """(N, 2) around pixels."""

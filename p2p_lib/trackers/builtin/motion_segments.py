@@ -14,6 +14,7 @@ from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.robust import consensus
+from p2p_lib.trackers.builtin.direct_alignment import overruling
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import PointPrediction, PoseFit, fit_pose, pose_distance_m, predict
@@ -32,11 +33,13 @@ _REPEATS = 4.0
 _PLACED_PX, _OBSERVED_PX = 0.2, 0.3
 #: A neighbouring pixel's depth may be read: depth noise of an observation is larger than the sensor's by this.
 _DEPTH_NOISE = 1.5
+#: Points farther from where the surface takes them, beyond its errors, say nothing of its motion, px.
+_WITH_PX = 2.0
 _EYE2, _EYE3 = np.eye(2), np.eye(3)
 #: A segment is matched where fewer than this share of the points are followed that were seen on it.
 _FOLLOWED = 0.5
-#: Covariance of a matched corner on its segment (m^2), and of where it is seen (px^2).
-_MATCHED_M2, _MATCHED_PX2 = 0.001**2 * _EYE3, 1.5**2 * _EYE2
+#: Covariance of a matched corner on its segment, m^2.
+_MATCHED_M2 = 0.001**2 * _EYE3
 
 
 @dataclass(eq=False)
@@ -48,7 +51,8 @@ class MotionSegment:
     rejected      (M, 3) points in the camera's frame where it was found wrongly: a look-alike may be there
     rejected_for  frames for which it is not searched for around them
     last_view     the newest frame in which it had a pose; None before it has points enough to be searched for
-    matched       what corners of that frame have been matched with in the newest one; None where nothing
+    matched       what corners or the surface of that frame have been matched with in the newest one; None where nothing
+    T_by_points   its pose in that frame by its points alone, where they were overruled; None: as it is
     """
 
     fit: PoseFit
@@ -59,6 +63,7 @@ class MotionSegment:
     landmarks: Landmarks = field(default_factory=Landmarks)
     last_view: SegmentView | None = None
     matched: Matched | None = None
+    T_by_points: np.ndarray | None = None
 
     @property
     def posed(self) -> bool:
@@ -126,10 +131,13 @@ class MotionSegments:
             segment.rejected_for, segment.matched = max(segment.rejected_for - 1, 0), None
         fits = [self._fitted(segment.extrapolated, p, at, now) for segment, at in zip(self.segments, rows, strict=True)]
         self._match(fits, now, search)
+        self._overrule(fits, now)
         for segment, at, fit in zip(self.segments.copy(), rows, fits, strict=True):
             if (pairs := segment.matched) is not None:
                 start = pairs.T_cam_seg
-                if fit is not None and self._same(fit.T_cam_seg, start, fit.centre):
+                if pairs.overruling:
+                    at = self._with(self._fitted(start, p, at[:0], now, pairs=pairs), p, at, now)
+                elif fit is not None and self._same(fit.T_cam_seg, start, fit.centre):
                     start = fit.T_cam_seg
                 fit = self._fitted(start, p, at, now, pairs=pairs)
             if fit is None:
@@ -140,6 +148,15 @@ class MotionSegments:
             p.verified[at[~fit.agrees]] = False
             if segment.matched is None:  # else they were left behind
                 self._split(p, at[~fit.agrees], now)
+
+    @staticmethod
+    def _with(fit: PoseFit | None, p: Points, at: np.ndarray, now: Image) -> np.ndarray:
+        """Points, of the rows ``at``, that move with a segment, as far as is known how that moves."""
+        if fit is None or not len(at):
+            return at
+        T, covariance, centre = (np.repeat(a[None], len(at), 0) for a in (fit.T_cam_seg, fit.covariance, fit.centre))
+        there = predict(T, covariance, centre, p.p_seg[at], p.map_cov[at], p.tangent[at], now.camera)
+        return at[np.linalg.norm(there.uv_px - p.uv[at], axis=1) < _WITH_PX + 3 * there.sigma_px]
 
     def fit_found(self, p: Points, now: Image, sought: np.ndarray, fewest: float) -> None:
         """Fit poses of lost segments to the points found among those sought, rows (M,), a share of these at least.
@@ -154,6 +171,8 @@ class MotionSegments:
                 if len(at) < MIN_FOUND * shown:
                     segment.hidden_for, p.verified[at] = 1, False
                 continue
+            if segment.matched is not None and segment.matched.overruling:
+                at = self._with(segment.fit, p, at, now)
             least = fewest * shown if segment.matched is None else 0.0
             fit = self._fitted(segment.fit.T_cam_seg, p, at, now, least, segment.matched)
             if fit is not None:
@@ -175,7 +194,8 @@ class MotionSegments:
         """A segment's pose, near ``start``, by its points at these rows and by ``pairs``; None where few agree."""
         seen = [p.p_seg[at], p.map_cov[at], p.uv[at].astype(float), p.cov[at].astype(float), now.depth_at(p.uv[at])]
         if pairs is not None:
-            noise_m2, noise_px2 = (np.repeat(cov[None], len(pairs), 0) for cov in (_MATCHED_M2, _MATCHED_PX2))
+            noise_m2 = np.broadcast_to(_MATCHED_M2, (len(pairs), 3, 3))
+            noise_px2 = np.broadcast_to(pairs.cov_px2, (len(pairs), 2, 2))
             more = pairs.p_seg, noise_m2, pairs.uv_px, noise_px2, pairs.z_m
             seen = [np.concatenate(column) for column in zip(seen, more, strict=True)]
         fewest = max(self.config.segment_min_points, fewest)
@@ -211,6 +231,27 @@ class MotionSegments:
             if not (still and count >= MIN_FOUND * len(then.uv_px)):
                 segment.matched = pairs
 
+    def _overrule(self, fits: list[PoseFit | None], now: Image) -> None:
+        """Where what shows of a segment agrees clearly better with another motion than with its points', that counts.
+
+        Points that slide, as on reflections, agree with each other.
+        """
+        for segment, fit in zip(self.segments, fits, strict=True):
+            then = segment.last_view
+            if then is None or segment.hidden_for >= self.config.linger_frames or segment.rejected_for:
+                continue
+            T_seg_then = se3.inverse(then.T_cam_seg)
+            known = [] if segment.matched is None else [segment.matched.T_cam_seg @ T_seg_then]
+            if fit is not None:
+                # From frame to frame: by their places alone points have no errors that add up.
+                by_points = T_seg_then if segment.T_by_points is None else se3.inverse(segment.T_by_points)
+                known.append(fit.T_cam_seg @ by_points)
+            predicted = segment.extrapolated @ T_seg_then
+            far = fit is None or bool(np.count_nonzero(fit.agrees) < _FOLLOWED * len(then.uv_px))
+            motion = overruling(then.surface, then.patch(now), known, predicted, self.config.overruled_below, far)
+            if motion is not None:
+                segment.matched = then.carried(motion, now)
+
     def _same(self, T_a: np.ndarray, T_b: np.ndarray, centre: np.ndarray) -> bool:
         """Whether two poses of a segment differ by less than points that agree."""
         return pose_distance_m(T_a, T_b, centre) < self.config.segment_inlier_m
@@ -220,7 +261,11 @@ class MotionSegments:
         for s, segment in enumerate(self.segments):
             own = p.visible & (p.segment == s)
             if segment.posed and np.count_nonzero(own) >= 2 * self.config.segment_min_points:
-                found = None if segment.matched is None else segment.matched.found
+                found, segment.T_by_points = None if segment.matched is None else segment.matched.found, None
+                if segment.matched is not None and segment.matched.overruling:
+                    alone = np.flatnonzero(p.verified & (p.segment == s))
+                    fit = self._fitted(segment.fit.T_cam_seg, p, alone, now)
+                    segment.T_by_points = None if fit is None else fit.T_cam_seg
                 segment.last_view = SegmentView(now, p.uv[own], segment.fit.T_cam_seg, search, found)
 
     def _split(self, p: Points, strays: np.ndarray, now: Image) -> None:

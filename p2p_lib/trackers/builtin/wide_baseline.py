@@ -1,4 +1,4 @@
-"""Wide-baseline matching: how a rigid motion segment moved where short steps fail, by the corners of two frames.
+"""A segment as it was seen last, and wide-baseline matching: how it moved where short steps fail, by its corners.
 
 A fast turn, a fast camera or blur leaves nothing for Lucas-Kanade, whose steps are short, and little for templates.
 Corners described on the surface are still the same: those of the segment in the frame where it was seen last are
@@ -19,6 +19,7 @@ from p2p_lib.core import robust, se3
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.image import in_mask
+from p2p_lib.trackers.builtin.direct_alignment import Patch, Surface
 from p2p_lib.trackers.builtin.features import mutual_match
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Corners, corners
@@ -27,6 +28,10 @@ from p2p_lib.trackers.builtin.landmarks import Corners, corners
 CORNERS, _MOST = 400, 900
 #: A segment reaches so far beyond the hull of its points; it may move by these from frame to frame.
 _BESIDE_PX, _MOVES_PX, _MOVES_M = 6, 80, 0.08
+#: Error of a corner's place, px.
+_CORNER_PX = 1.5
+#: What is measured nearer to it than this shows the surface, m.
+_ON_SURFACE_M = 0.006
 #: Corners nearer to the border of a region are of its outline, px.
 _BORDER_PX = 4
 #: A corner is on it that is nearer to one of its points than so many times their own distance, within these bounds.
@@ -74,13 +79,53 @@ class SegmentView:
             found = corners(self.image, self.own, CORNERS)
         else:
             found = found.select(in_mask(found.uv_px, self.own))
+        return found.select(self._on_it(found.p_cam))
+
+    def _on_it(self, p_cam: np.ndarray) -> np.ndarray:
+        """Which of these places (N, 3) are near its points: what is before it, or beside it, is not."""
         z = self.image.depth_at(self.uv_px)
-        p_cam = self.image.camera.unproject(self.uv_px[z > 0], z[z > 0])
-        if len(p_cam) < 2:
-            return found.select(np.zeros(len(found.uv_px), bool))
-        tree = cKDTree(p_cam)
-        apart_m = np.clip(_SPACINGS * np.median(tree.query(p_cam, 2)[0][:, 1]), *_NEAR_M)
-        return found.select(tree.query(found.p_cam)[0] < apart_m)
+        points = self.image.camera.unproject(self.uv_px[z > 0], z[z > 0])
+        if len(points) < 2:
+            return np.zeros(len(p_cam), bool)
+        tree = cKDTree(points)
+        apart_m = np.clip(_SPACINGS * np.median(tree.query(points, 2)[0][:, 1]), *_NEAR_M)
+        return tree.query(p_cam)[0] < apart_m
+
+    @cached_property
+    def _box(self) -> np.ndarray:
+        """(2, 2) corners of where it is and can be in the next frame, px of half the resolution."""
+        reach = [_MOVES_PX, _BESIDE_PX]
+        return np.array(
+            [np.floor((self.uv_px.min(0) - sum(reach)) / 2), np.ceil((self.uv_px.max(0) + sum(reach)) / 2)], int
+        )
+
+    @cached_property
+    def surface(self) -> Surface:
+        """What showed of it, for direct alignment."""
+        patch, corner = Patch.of(self.image, *self._box), np.maximum(self._box[0], 0)
+        hull = np.zeros(patch.depth_m.shape, np.uint8)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(self.uv_px / 2).astype(np.int32) - corner.astype(np.int32)), 1)
+        own = cv2.dilate(hull, np.ones((_BESIDE_PX + 1,) * 2, np.uint8)) > 0
+        if self.search is not None:
+            end = corner + own.shape[::-1]
+            search = self.search[::2, ::2][corner[1] : end[1], corner[0] : end[0]]
+            own &= cv2.erode(search.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        shown = patch.surface(own)
+        return shown.select(np.flatnonzero(self._on_it(shown.p_cam)))
+
+    def patch(self, now: Image) -> Patch:
+        """Where it can be in the next frame."""
+        return Patch.of(now, *self._box)
+
+    def carried(self, motion: np.ndarray, now: Image) -> Matched:
+        """Its surface taken along by a motion (4, 4), as far as that shows: as pairs."""
+        p_cam = se3.transform(motion, self.surface.p_cam)
+        uv_px = now.camera.project(p_cam)
+        shows = np.abs(now.depth_at(uv_px) - p_cam[:, 2]) < _ON_SURFACE_M
+        p_seg = se3.transform(se3.inverse(self.T_cam_seg), self.surface.p_cam[shows])
+        return Matched(
+            motion @ self.T_cam_seg, p_seg, uv_px[shows], p_cam[shows, 2], None, self.surface.cov_px2[shows], True
+        )
 
     def region(self, now: Image) -> np.ndarray:
         """(H, W) bool: where the segment can be one frame later, by its place, its depth and its colours."""
@@ -111,14 +156,18 @@ class SegmentView:
 class Matched:
     """The pose T_cam_seg (4, 4) that pairs agree on; of those p_seg (M, 3), uv_px (M, 2), z_m (M,).
 
-    found  the corners that were searched
+    found      the corners that were searched; None where none were
+    cov_px2    (M, 2, 2) of uv_px
+    overruling whether the pose stands against that of the points
     """
 
     T_cam_seg: np.ndarray
     p_seg: np.ndarray
     uv_px: np.ndarray
     z_m: np.ndarray
-    found: Corners
+    found: Corners | None = None
+    cov_px2: np.ndarray = field(default_factory=lambda: _CORNER_PX**2 * np.eye(2))
+    overruling: bool = False
 
     def __len__(self) -> int:
         return len(self.p_seg)
