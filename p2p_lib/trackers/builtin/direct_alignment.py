@@ -248,16 +248,23 @@ def _read(image, u, v, out):
         out[c] = upper * (1 - b) + lower * b
 
 
+@compiled()
+def _moved(T, point, by, out):
+    """A point (``by`` 1) or a direction (0), moved, into out (3,)."""
+    for i in range(3):
+        out[i] = T[i, 0] * point[0] + T[i, 1] * point[1] + T[i, 2] * point[2] + by * T[i, 3]
+
+
 @compiled("f8[:,:,::1], f8[:,::1], f8[:,::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8")
 def _costs(motions, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy):
-    count, here = len(p_cam), np.zeros(4)
+    count, here, p, m = len(p_cam), np.zeros(4), np.zeros(3), np.zeros(3)
     costs = np.full(len(motions), 2.0)
     for k in range(len(motions)):
-        R, t = np.ascontiguousarray(motions[k, :3, :3]), motions[k, :3, 3]
-        at, facing = p_cam @ R.T + t, normals @ R.T
         shown, total = 0, 0.0
         for n in range(count):
-            u, v, off = _shows(at[n], facing[n], depth_m, fx, fy, cx, cy)
+            _moved(motions[k], p_cam[n], 1.0, p)
+            _moved(motions[k], normals[n], 0.0, m)
+            u, v, off = _shows(p, m, depth_m, fx, fy, cx, cy)
             if u < 0:
                 continue
             _read(image, u, v, here)
@@ -274,17 +281,24 @@ def _costs(motions, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy):
 @compiled("f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8, i8")
 def _aligned(motion, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy, steps):
     """Iteratively reweighted Gauss-Newton (Geman-McClure) on colours and on distances to the measured surface."""
-    count = len(p_cam)
-    R, t = np.ascontiguousarray(motion[:3, :3]), motion[:3, 3].copy()
+    count, T, p, m, middle = len(p_cam), motion.copy(), np.zeros(3), np.zeros(3), np.zeros(3)
     here, right, left, below, above = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
-    J, r, weights = np.zeros((5, 6)), np.zeros(5), np.zeros(5)
+    J, r, H, g, mean = np.zeros((5, 6)), np.zeros(5), np.zeros((6, 6)), np.zeros(6), np.zeros(3)
+    for n in range(count):
+        for i in range(3):
+            mean[i] += p_cam[n, i] / count
     for _ in range(steps):
-        # Kept where it is, by little: what nothing shows does not move.
-        H, g, shown = np.diag(np.array([0.01, 0.01, 0.01, 1.0, 1.0, 1.0])) * count, np.zeros(6), 0
-        at, facing = p_cam @ R.T + t, normals @ R.T
-        middle = at.sum(0) / count
+        for i in range(6):
+            g[i] = 0.0
+            for j in range(6):
+                H[i, j] = 0.0
+            # Kept where it is, by little: what nothing shows does not move.
+            H[i, i] = (0.01 if i < 3 else 1.0) * count
+        shown = 0
+        _moved(T, mean, 1.0, middle)
         for n in range(count):
-            p, m = at[n], facing[n]
+            _moved(T, p_cam[n], 1.0, p)
+            _moved(T, normals[n], 0.0, m)
             u, v, off = _shows(p, m, depth_m, fx, fy, cx, cy)
             if u < 0:
                 continue
@@ -303,40 +317,43 @@ def _aligned(motion, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy, st
             # Distance from the measured point, on the same ray, to the tangent plane.
             r[4] = (m[0] * p[0] + m[1] * p[1] + m[2] * z) / z * off / _DEPTH_M
             J[4, 3], J[4, 4], J[4, 5] = -m[0] / _DEPTH_M, -m[1] / _DEPTH_M, -m[2] / _DEPTH_M
-            for c in range(4):
-                weights[c] = 1 / (1 + off_colour) ** 2
-            weights[4] = 1 / (1 + (off / _DEPTH_M) ** 2) ** 2
             ax, ay, az = p[0] - middle[0], p[1] - middle[1], p[2] - middle[2]
             for c in range(5):
                 dx, dy, dz = J[c, 3], J[c, 4], J[c, 5]
                 J[c, 0], J[c, 1], J[c, 2] = dz * ay - dy * az, dx * az - dz * ax, dy * ax - dx * ay
+                weight = 1 / (1 + (off_colour if c < 4 else (off / _DEPTH_M) ** 2)) ** 2
                 for i in range(6):
-                    g[i] += weights[c] * J[c, i] * r[c]
+                    g[i] -= weight * J[c, i] * r[c]
                     for j in range(6):
-                        H[i, j] += weights[c] * J[c, i] * J[c, j]
+                        H[i, j] += weight * J[c, i] * J[c, j]
         if shown < 20:
             break
-        step = -np.linalg.solve(H, g)
-        angle = np.sqrt((step[:3] ** 2).sum())
-        if angle > 0.2:
-            step *= 0.2 / angle
-        turn = _rotation(step[:3])
-        R, t = turn @ R, turn @ (t - middle) + middle + step[3:]
-        if angle < 5e-4 and np.abs(step[3:]).max() < 1e-4:
+        step = np.linalg.solve(H, g)
+        angle = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+        scale = min(1.0, 0.2 / max(angle, 1e-12))
+        farthest = max(abs(step[3]), abs(step[4]), abs(step[5]))
+        for i in range(6):
+            step[i] *= scale
+        _turn(T, step, middle)
+        if angle < 5e-4 and farthest < 1e-4:
             break
-    T = np.eye(4)
-    for i in range(3):
-        T[i, 3] = t[i]
-        for j in range(3):
-            T[i, j] = R[i, j]
     return T
 
 
 @compiled()
-def _rotation(w):
-    """(3, 3) turn about w (3,) by its length, rad."""
-    angle, W = np.sqrt((w * w).sum()), np.zeros((3, 3))
-    W[0, 1], W[0, 2], W[1, 2], W[1, 0], W[2, 0], W[2, 1] = -w[2], w[1], -w[0], w[2], -w[1], w[0]
-    if angle < 1e-9:
-        return np.eye(3) + W
-    return np.eye(3) + np.sin(angle) / angle * W + 2 * (np.sin(angle / 2) / angle) ** 2 * (W @ W)
+def _turn(T, step, middle):
+    """Turn T (4, 4), in place, about ``middle`` by the first three of ``step`` (rad), and move it by the others."""
+    angle = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+    a = np.sin(angle) / angle if angle > 1e-9 else 1.0
+    b = 2 * (np.sin(angle / 2) / angle) ** 2 if angle > 1e-9 else 0.5
+    for k in range(4):
+        x, y, z = T[0, k], T[1, k], T[2, k]
+        if k == 3:
+            x, y, z = x - middle[0], y - middle[1], z - middle[2]
+        # Rodrigues: v + a w x v + b w x (w x v)
+        cx, cy, cz = step[1] * z - step[2] * y, step[2] * x - step[0] * z, step[0] * y - step[1] * x
+        dx, dy, dz = step[1] * cz - step[2] * cy, step[2] * cx - step[0] * cz, step[0] * cy - step[1] * cx
+        T[0, k], T[1, k], T[2, k] = x + a * cx + b * dx, y + a * cy + b * dy, z + a * cz + b * dz
+        if k == 3:
+            for i in range(3):
+                T[i, k] += middle[i] + step[3 + i]
