@@ -9,15 +9,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from p2p_lib.core.image import bounds, in_image, nearest_px, outline_px, shares
+from p2p_lib.core.image import in_image, nearest_px, outline_px
 from p2p_lib.core.types import SPARSE, Frame
 
 #: Pixels that changed by less in each of red, green and blue, in grey levels, look the same.
 _SAME_GREY = 12
 #: So many places have to tell whether the camera stands still, and at least this share of them that it does.
 _TELLING, _STANDS = 30, 0.4
-#: Of an object that has not moved, so large a share of what tells looks the same, in this many tiles a side.
-_MOST_ALIKE, _TILES = 0.7, 4
 #: Depth is compared this many px to either side of the outline, at this many places at least; a step is larger, m.
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
 
@@ -35,22 +33,6 @@ def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.n
         return 1.0
     same &= (now_m > 0) & (then_m > 0)
     return float(np.median(now_m[same] / then_m[same])) if same.sum() >= _TELLING else 1.0
-
-
-def looks_alike(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> bool:
-    """Whether what both masks (H, W) bool show looks as it did, in half of its tiles: a hand may move before some.
-
-    False where too little of it differs from what is beside. Much less looks the same once it has turned by a degree.
-    """
-    both = mask & mask_before
-    if not both.any():
-        return False
-    box = bounds(both)
-    now, then = frame.rgb[box], before.rgb[box]
-    v, u = np.nonzero(both[box] & _telling(then))
-    tile = v * _TILES // now.shape[0] * _TILES + u * _TILES // now.shape[1]
-    share = shares(tile, _alike(now, then)[v, u], _TELLING)
-    return len(share) > 0 and float(np.median(share)) >= _MOST_ALIKE
 
 
 def _telling(rgb: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ after, so each is weighted by the confidence of the pose that placed it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -33,8 +33,6 @@ _DRIFT_SHARE, _UNCONSTRAINED_RAD = 0.03, 1.0
 #: the agreeing keypoints + 1, their share of those seen. Fitted on ``fading_label``, ``weak_texture`` and ``crossing``,
 #: degraded until half of the poses were wrong; ``benchmarks/bench_confidence.py`` judges them on other seeds.
 _CONSTANT, _LOG_SIGMA, _LOG_INLIERS, _AGREEMENT = -2.0, -0.75, 1.1, 0.9
-#: A surface that shows as a whole is worth so many keypoints.
-_SHOWN = 15.0
 
 
 def pose_covariance(
@@ -100,10 +98,6 @@ class Belief:
         assert best.refined is not None, "a pose that is believed was refined"
         free, slides = best.refined.free_rotations, may_slide(best.refined, config.refinement.min_eigenvalue)
         return cls(policy.covariance(obs, known, best), free, slides, constrained, support, agreement)
-
-    def shown(self, share: float) -> Belief:
-        """With this share of the surface, which shows in the image, in the place of keypoints."""
-        return replace(self, support=self.support + _SHOWN * share, agreement=max(self.agreement, share))
 
     def at(
         self, T_cam_obj: np.ndarray, model: ObjectModel, most: float, constrained: bool | None = None

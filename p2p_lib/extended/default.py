@@ -52,7 +52,6 @@ MECHANISMS = {
     "motion_over_gaps": "The motion of an absent object is extrapolated for a while.",
     "moving_points": "A point becomes a keypoint only if it moves with the object.",
     "pending_points": "While an object is followed, pending points help to register it.",
-    "slips": "Points that slid in a fast turn are given up for a turn under which clearly more of the surface shows.",
     "turns": "The pose of a return is compared with other rotations that look alike.",
     # Inside: gates.
     "return_gate": "A return needs many agreeing points, or a match of shape and colour.",

@@ -58,8 +58,6 @@ _ANYWHERE = 0.7
 _PROMISING, _POLISH_SCALES = 0.3, (1.0, 0.4)
 _NEARBY = np.random.default_rng(0).normal(size=(150, 6)) * np.repeat([0.06, 0.015], 3)
 _NEARBY[0] = 0
-#: One pose shows clearly more than another by so many standard errors, of shares of so many points: a third faces it.
-_ERRORS, _COMPARED = 2.0, _POINTS // 3
 #: Iterations of the alignment, and its regularisation: a prior of these standard deviations, rad and m.
 _ITERATIONS, _FREE = 6, np.diag(np.repeat([0.1, 0.03], 3) ** -2.0)
 
@@ -101,13 +99,6 @@ class Sighting:
     def alike(self) -> float:
         """The share of points found on the surface that have their colour; 1 if there are none."""
         return len(self.uv_px) / self.measured if self.measured else 1.0
-
-    def clearly_above(self, other: Sighting) -> bool:
-        """Whether more shows than under another pose, by two standard errors of two shares of so many points."""
-        shares = np.clip([self.share, other.share], 0.0, 1.0)
-        # A share of all or nothing is not known exactly either.
-        variance = ((shares * (1 - shares)).sum() + 0.01) / _COMPARED
-        return bool(self.share - other.share >= _ERRORS * np.sqrt(variance))
 
 
 def most_shown(found: Iterable[Sighting | None]) -> Sighting | None:

@@ -14,8 +14,8 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
-from p2p_lib.core.types import DOUBTED, Frame, Status
-from p2p_lib.extended.agreement import looks_alike, scene_ratio
+from p2p_lib.core.types import DOUBTED, Status
+from p2p_lib.extended.agreement import scene_ratio
 from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
 from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge
@@ -55,13 +55,11 @@ class Proposal(Candidate):
     sighting  share of the surface that shows under its pose; None: not looked for
     shown     what of the surface shows under its pose, while its colours are in question; None: not looked for
     lead      how much more shows than under the best other turn, as a share; None: not compared
-    slipped   whether it has replaced the pose of points that had slid over the surface
     """
 
     sighting: float | None = None
     shown: Sighting | None = None
     lead: float | None = None
-    slipped: bool = False
 
     @property
     def evidence(self) -> PoseEvidence:
@@ -214,8 +212,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         best, reason = self._best(obs, known, candidates)
         if best is None:
             return None, reason
-        best = self._without_slip(obs, known, best if best.refined else self.refine(obs, known, best))
-        return self._told_from_turns(obs, known, best), reason
+        return self._told_from_turns(obs, known, best if best.refined else self.refine(obs, known, best)), reason
 
     def _best(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> tuple[Proposal | None, str]:
         """The candidate to go on with, and why."""
@@ -250,30 +247,6 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         share = [None if s is None or not life.unconfirmed else s.share for s in found]
         held = [s if c.hypothesis.support >= FIXED_BY else None for c, s in zip(candidates, found, strict=True)]
         return [replace(c, sighting=s, shown=at) for c, s, at in zip(candidates, share, held, strict=True)]
-
-    def _without_slip(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
-        """The pose of a followed object, or another turn in its place under which clearly more of the surface shows.
-
-        In a fast turn points slide over the surface, all alike, and agree on a pose that has stayed behind. That is
-        looked for where few keypoints agree; new points do not count, they agree with whatever placed them. Over what
-        looks as it did, none slides.
-        """
-        agree = np.count_nonzero(best.hypothesis.inliers & known.keypoints(obs))
-        many = agree >= self.config.lifecycle.return_inliers
-        due = not (many or known.life.unconfirmed or obs.mask is None)
-        if not (due and self.shape.knows(known) and "slips" in self.on) or self._looks_as_before(obs):
-            return best
-        assert best.refined is not None, "it is refined before it is compared"
-        if may_slide(best.refined, self.config.refinement.min_eigenvalue, 2):
-            return best  # something flat shows as much a little farther on
-        near = self.shape.turned_near(obs, known, best.T_cam_obj, list(known.life.motion_priors().values()))
-        if near is None or near.share < SIGHTED:
-            return best
-        residual_m = np.linalg.norm(obs.p_cam - se3.transform(near.T_cam_obj, known.map.p_obj), axis=1)
-        residual_m[~obs.seen] = np.inf
-        agrees = residual_m <= self.config.registration.inlier_m
-        turned = Proposal(Hypothesis(near.T_cam_obj, agrees, residual_m, "surface"))
-        return replace(self.refine(obs, known, turned), sighting=near.share, slipped=True)
 
     def _told_from_turns(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
@@ -329,22 +302,12 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         near = same_place(place, best.T_cam_obj)
         return near or (None if empty(self.observer, obs.frame, place, known.map.p_obj) else False)
 
-    def _now_and_before(self, obs: OurObservation) -> tuple[Frame, np.ndarray, Frame, np.ndarray] | None:
-        """This frame with its mask, and the newest one without a doubt with its own; None unless both have one."""
-        before = self.trusted
-        if obs.mask is None or before is None or before.mask is None:
-            return None
-        return obs.frame, obs.mask, before.frame, before.mask
-
-    def _looks_as_before(self, obs: OurObservation) -> bool:
-        """Whether it looks as in the newest frame without a doubt, so that it has not turned since."""
-        views = self._now_and_before(obs)
-        return views is not None and looks_alike(*views)
-
     def _scene_ratio(self, obs: OurObservation) -> float:
         """How far away the resting scene is measured, over what it was in the newest frame without a doubt."""
-        views = self._now_and_before(obs)
-        return 1.0 if views is None else scene_ratio(*views)
+        before = self.trusted
+        if obs.mask is None or before is None or before.mask is None:
+            return 1.0
+        return scene_ratio(obs.frame, obs.mask, before.frame, before.mask)
 
     def outline(self, obs: OurObservation) -> float:
         """Share of the mask's outline along depth steps, relative to that in the newest frame without a doubt."""
@@ -357,8 +320,6 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         """Nothing is learnt from a doubted pose, and one of little confidence makes no keyframe."""
         assert isinstance(best, Proposal) and isinstance(verdict, Judgement)
         belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
-        if belief is not None and best.slipped and best.sighting is not None:
-            belief = belief.shown(best.sighting)
         shown = best.shown if "colours" in self.on else None
         life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead, shown)
         most = DOUBTED if verdict.doubted or life.doubted else 1.0

@@ -9,7 +9,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from p2p_lib.core import se3
 from p2p_lib.core.config import Config
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame
@@ -20,8 +19,6 @@ from p2p_lib.extended.observation import OurObservation, cut_off
 from p2p_lib.method.observation import Observer
 from p2p_lib.method.refinement import surface_distances
 
-#: A pose is another turn in the same place from the first, rad, on, and within the second, m.
-_TURNED_RAD, _PLACE_M = np.radians(10), 0.02
 #: One frame in so many looks for a lost object in its mask, in the turns of at most so many keyframes. Depth this near
 #: to its surface is on it, m.
 _TURN_EVERY, _TURNS, _ON_M = 2, 40, 0.01
@@ -52,21 +49,6 @@ class ShapeSearch:
         """What of the surface shows under each of some poses; None where too little would show."""
         search = self._search(obs.frame)
         return [search.at(T_cam_obj, self.sample(known.model)) for T_cam_obj in poses]
-
-    def turned_near(
-        self, obs: OurObservation, known: OurKnown, T_cam_obj: np.ndarray, priors: list[np.ndarray]
-    ) -> Sighting | None:
-        """Near a pose or ``priors`` (4, 4) the one that shows most, if clearly more than the pose, which it turns."""
-        with self._stopwatch("search"):
-            search, sample = self._search(obs.frame), self.sample(known.model)
-            own = search.at(T_cam_obj, sample)
-            near = most_shown([search.about(T, sample) for T in (T_cam_obj, *priors)])
-        if own is None or near is None or not near.clearly_above(own):
-            return None
-        centre = sample.p_obj.mean(0)
-        away_m = np.linalg.norm(se3.transform(T_cam_obj, centre) - se3.transform(near.T_cam_obj, centre))
-        turned_rad = se3.angle_rad(se3.inverse(T_cam_obj) @ near.T_cam_obj)
-        return near if turned_rad >= _TURNED_RAD and away_m <= _PLACE_M else None
 
     def sighted(self, obs: OurObservation, known: OurKnown, carried: bool) -> Sighting | None:
         """Where a sought object shows: near its place by scene, motion or the frame before, or in its mask."""

@@ -214,19 +214,7 @@ class TwoMaps:
         assert isinstance(verdict, Judgement)
         if not verdict.doubted:
             self.policy.trusted = obs
-        if isinstance(best, Proposal) and best.slipped and not verdict.doubted:
-            return self._placed_anew(obs, best, verdict)
         return self.own.accept(obs, best, verdict)
-
-    def _placed_anew(self, obs: OurObservation, best: Proposal, verdict: Judgement) -> ObjectStep:
-        """Take a pose that contradicts most points: these have slid, are given up, and a keyframe places new ones."""
-        slid = obs.seen & ~best.hypothesis.inliers
-        wrong = self.map.ids[slid & self.map.promoted]
-        # The time of the pending ones is over: the keyframe retires them.
-        self.map.age[slid & ~self.map.promoted] = self.config.keypoint_map.pending_ttl + 1
-        unseen = replace(obs, p_cam=np.where(slid[:, None], np.nan, obs.p_cam))
-        step = self.own.accept(unseen, best, verdict, due=not self.policy.frozen)
-        return replace(step, requests=replace(step.requests, reject=wrong))
 
     # -- a new map -----------------------------------------------------------------------------
 

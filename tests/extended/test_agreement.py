@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from p2p_lib.core.types import Frame
-from p2p_lib.extended.agreement import looks_alike, outline_share, scene_ratio
+from p2p_lib.extended.agreement import outline_share, scene_ratio
 from p2p_lib.extended.frame_guard import StaleFrames
 
 
@@ -73,37 +73,6 @@ def test_at_the_border_of_the_image_depth_has_no_step():
     shown = [outline_share(*scene(left)) for left in (30, 60, 0)]
     assert shown == [1, pytest.approx(0.75, abs=0.05), pytest.approx(0.75, abs=0.05)], "one side of a square is cut off"
     assert outline_share(inside, np.ones_like(mask)) == 0, "it ends nowhere"
-
-
-def speckled(shift: int = 0, contrast: int = 120) -> tuple[Frame, np.ndarray]:
-    """Speckles in a mask of 60 px a side, which stays."""
-    grey = 60 + cv2.GaussianBlur(np.random.default_rng(0).uniform(0, contrast, (80, 120)), (0, 0), 1.0)
-    mask = np.zeros((80, 80), bool)
-    mask[10:70, 10:70] = True
-    rgb = np.repeat(grey[:, shift : shift + 80, None].astype(np.uint8), 3, 2)
-    return Frame(0, 0.0, rgb, np.where(mask, 0.5, 0.9).astype(np.float32)), mask
-
-
-def test_an_object_looks_as_it_did_until_it_moves_by_a_pixel_or_two():
-    before, mask = speckled()
-    noise = np.random.default_rng(1).integers(-5, 6, before.rgb.shape)
-    noisy = replace(before, rgb=(before.rgb + noise).astype(np.uint8))
-    assert looks_alike(noisy, mask, before, mask)
-    assert not looks_alike(speckled(2)[0], mask, before, mask)
-    assert not looks_alike(noisy, mask, before, np.zeros_like(mask)), "there is nothing to compare"
-
-
-def test_a_hand_over_less_than_half_of_an_object_does_not_move_it():
-    before, mask = speckled()
-    for covered, still in ((20, True), (45, False)):
-        rgb = before.rgb.copy()
-        rgb[:, 10 : 10 + covered] = (200, 150, 120)
-        assert looks_alike(replace(before, rgb=rgb), mask, before, mask) is still
-
-
-def test_what_is_plain_never_tells_whether_it_moved():
-    before, mask = speckled(contrast=0)
-    assert not looks_alike(before, mask, before, mask)
 
 
 def stood(frame: Frame, before: Frame) -> tuple[bool, bool]:

@@ -11,7 +11,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
 from p2p_lib.core.types import Frame
 from p2p_lib.extended.gates import SIGHTED
-from p2p_lib.extended.image_search import ImageSearch, Sighting, SurfaceSample, centred_at_points
+from p2p_lib.extended.image_search import ImageSearch, SurfaceSample, centred_at_points
 from p2p_lib.method.observation import sample_cloud
 from tests.method import analytic_scene
 
@@ -245,20 +245,3 @@ def test_of_many_places_those_that_differ_are_looked_at():
     ]
     for centre in (PLACE[:3, 3], beside[:3, 3]):
         assert np.linalg.norm(found - centre, axis=1).min() < 0.005
-
-
-@pytest.mark.parametrize(
-    ("more", "less", "clearly"),
-    [
-        (0.91, 0.73, True),
-        (0.6, 0.48, False),
-        (0.6, 0.4, True),
-        (1.0, 0.97, False),
-        (0.5, -0.3, True),
-        (0.4, 0.6, False),
-    ],
-)
-def test_two_shares_are_apart_by_two_standard_errors(more, less, clearly):
-    """Of a hundred points each: the error is greatest for a half, and a share below 0 is none."""
-    one, other = (Sighting(np.eye(4), share, np.zeros((0, 2))) for share in (more, less))
-    assert one.clearly_above(other) == clearly
