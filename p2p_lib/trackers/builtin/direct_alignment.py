@@ -96,7 +96,7 @@ class Patch:
         """Points evenly over a region ``own`` (H, W) of it, where the surface is smooth enough to have a normal."""
         v, u = np.nonzero(own)
         every = max(1, len(v) // (2 * _MOST_POINTS))
-        v, u = v[::every], u[::every]
+        v, u = np.ascontiguousarray(v[::every]), np.ascontiguousarray(u[::every])
         p_cam, normals, smooth = _points(self.depth_m, u, v, *self.intrinsics)
         rows = np.flatnonzero(smooth)
         rows = rows[np.linspace(0, len(rows) - 1, min(_MOST_POINTS, len(rows))).astype(int)]
