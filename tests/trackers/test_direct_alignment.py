@@ -107,6 +107,11 @@ def test_colours_tell_a_place_across_an_edge_alone():
     assert np.sqrt(of_nothing[:, [0, 1], [0, 1]]).min() > 6
 
 
+def test_depth_of_far_things_may_be_off_by_more():
+    near, far = (surface(replace(ball(START), depth_m=ball(START).depth_m * times)) for times in (1, 5))
+    assert (near.depth_m == 0.006).all() and (far.depth_m > 0.012).all()
+
+
 def test_where_little_shows_nothing_is_judged():
     _, behind = turned(120)
     shown, now = surface(ball(START)), patch(ball(START))

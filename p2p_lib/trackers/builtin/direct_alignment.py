@@ -11,19 +11,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core.compiled import compiled
+from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.rigid_motion import pose_distance_m
 
 #: Standard deviations of the blur of what is compared, px of half the resolution: coarse, fine.
 _BLUR_PX = 2.5, 1.2
-#: A point does not agree whose colours (channels without their least, brightness) or depth differ by more.
-_COLOUR, _BRIGHTNESS, _DEPTH_M = 12.0, 100.0, 0.006
+#: A point does not agree whose colours (channels without their least, brightness) differ by more, or its depth, m, and
+#: by so many times its noise.
+_COLOUR, _BRIGHTNESS, _DEPTH_M, _DEPTH_SIGMAS = 12.0, 100.0, 0.006, 3.0
 #: Errors of colours as a share of those, neighbours having the same; of a point's place where nothing tells it, px.
 _NOISE, _UNKNOWN_PX = 0.7, 8.0
 #: What is measured nearer than a point by more than this hides it, m; seen more obliquely (cosine), it does not count.
@@ -48,17 +51,23 @@ class Surface:
 
     cov_px2  (N, 2, 2) how well the colours around a point tell where it is: little along an edge, nothing where all is
              of one colour
+    depth_m  (N,) depth that is off by more does not agree
     """
 
     p_cam: np.ndarray
     normals: np.ndarray
     colours: np.ndarray
     cov_px2: np.ndarray
+    depth_m: np.ndarray
 
     def select(self, rows: np.ndarray) -> Surface:
         """Some of the points."""
         return Surface(
-            self.p_cam[rows], self.normals[rows], np.ascontiguousarray(self.colours[:, rows]), self.cov_px2[rows]
+            self.p_cam[rows],
+            self.normals[rows],
+            np.ascontiguousarray(self.colours[:, rows]),
+            self.cov_px2[rows],
+            self.depth_m[rows],
         )
 
     @property
@@ -103,21 +112,20 @@ class Patch:
         u, v, fine = u[rows], v[rows], self.colours[1]
         slopes = np.stack([fine[v, u + 1] - fine[v, u - 1], fine[v + 1, u] - fine[v - 1, u]], 1) / 2  # (N, 2, 4)
         cov_px2 = np.linalg.inv(slopes @ slopes.transpose(0, 2, 1) / (4 * _NOISE**2) + np.eye(2) / _UNKNOWN_PX**2)
-        return Surface(p_cam[rows], normals[rows], np.stack([of[v, u] for of in self.colours]), cov_px2)
+        colours, depth_m = np.stack([of[v, u] for of in self.colours]), _DEPTH_SIGMAS * depth_noise_m(p_cam[rows, 2])
+        return Surface(p_cam[rows], normals[rows], colours, cov_px2, np.maximum(_DEPTH_M, depth_m))
 
     def costs(self, surface: Surface, motions: np.ndarray, level: int = 1) -> np.ndarray:
         """(K,) of motions (K, 4, 4) in the camera's frame: 0 where everything agrees, 2 where nothing does."""
-        return _costs(
-            np.ascontiguousarray(motions, float), surface.p_cam, surface.normals, surface.colours[level],
-            self.colours[level], self.depth_m, *self.intrinsics,
-        )  # fmt: skip
+        return _costs(np.ascontiguousarray(motions, float), *self._compared(surface, level))
 
     def aligned(self, surface: Surface, motion: np.ndarray, level: int = 1) -> np.ndarray:
         """The motion (4, 4) of least cost near this one."""
-        return _aligned(
-            np.ascontiguousarray(motion, float), surface.p_cam, surface.normals, surface.colours[level],
-            self.colours[level], self.depth_m, *self.intrinsics, _STEPS,
-        )  # fmt: skip
+        return _aligned(np.ascontiguousarray(motion, float), *self._compared(surface, level), _STEPS)
+
+    def _compared(self, surface: Surface, level: int) -> tuple[Any, ...]:
+        own = surface.p_cam, surface.normals, surface.depth_m, surface.colours[level]
+        return *own, self.colours[level], self.depth_m, *self.intrinsics
 
     def searched(self, surface: Surface, starts: np.ndarray) -> np.ndarray:
         """The motion (4, 4) of least cost near these (S, 4, 4), each after turns about the middle of the surface."""
@@ -255,8 +263,8 @@ def _moved(T, point, by, out):
         out[i] = T[i, 0] * point[0] + T[i, 1] * point[1] + T[i, 2] * point[2] + by * T[i, 3]
 
 
-@compiled("f8[:,:,::1], f8[:,::1], f8[:,::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8")
-def _costs(motions, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy):
+@compiled("f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8")
+def _costs(motions, p_cam, normals, off_m, colours, image, depth_m, fx, fy, cx, cy):
     count, here, p, m = len(p_cam), np.zeros(4), np.zeros(3), np.zeros(3)
     costs = np.full(len(motions), 2.0)
     for k in range(len(motions)):
@@ -272,14 +280,14 @@ def _costs(motions, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy):
             for c in range(4):
                 off_colour += (here[c] - colours[n, c]) ** 2
             shown += 1
-            total += min(off_colour, 1.0) + min((off / _DEPTH_M) ** 2, 1.0)
+            total += min(off_colour, 1.0) + min((off / off_m[n]) ** 2, 1.0)
         if shown > _LEAST_SHOWN * count:
             costs[k] = total / shown
     return costs
 
 
-@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8, i8")
-def _aligned(motion, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy, steps):
+@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8, i8")
+def _aligned(motion, p_cam, normals, off_m, colours, image, depth_m, fx, fy, cx, cy, steps):
     """Iteratively reweighted Gauss-Newton (Geman-McClure) on colours and on distances to the measured surface."""
     count, T, p, m, middle = len(p_cam), motion.copy(), np.zeros(3), np.zeros(3), np.zeros(3)
     here, right, left, below, above = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
@@ -315,13 +323,13 @@ def _aligned(motion, p_cam, normals, colours, image, depth_m, fx, fy, cx, cy, st
                 dx, dy = (right[c] - left[c]) / 2 * fx / z, (below[c] - above[c]) / 2 * fy / z
                 J[c, 3], J[c, 4], J[c, 5] = dx, dy, -(dx * p[0] + dy * p[1]) / z
             # Distance from the measured point, on the same ray, to the tangent plane.
-            r[4] = (m[0] * p[0] + m[1] * p[1] + m[2] * z) / z * off / _DEPTH_M
-            J[4, 3], J[4, 4], J[4, 5] = -m[0] / _DEPTH_M, -m[1] / _DEPTH_M, -m[2] / _DEPTH_M
+            r[4] = (m[0] * p[0] + m[1] * p[1] + m[2] * z) / z * off / off_m[n]
+            J[4, 3], J[4, 4], J[4, 5] = -m[0] / off_m[n], -m[1] / off_m[n], -m[2] / off_m[n]
             ax, ay, az = p[0] - middle[0], p[1] - middle[1], p[2] - middle[2]
             for c in range(5):
                 dx, dy, dz = J[c, 3], J[c, 4], J[c, 5]
                 J[c, 0], J[c, 1], J[c, 2] = dz * ay - dy * az, dx * az - dz * ax, dy * ax - dx * ay
-                weight = 1 / (1 + (off_colour if c < 4 else (off / _DEPTH_M) ** 2)) ** 2
+                weight = 1 / (1 + (off_colour if c < 4 else (off / off_m[n]) ** 2)) ** 2
                 for i in range(6):
                     g[i] -= weight * J[c, i] * r[c]
                     for j in range(6):

@@ -30,8 +30,6 @@ CORNERS, _MOST = 400, 900
 _BESIDE_PX, _MOVES_PX, _MOVES_M = 6, 80, 0.08
 #: Error of a corner's place, px.
 _CORNER_PX = 1.5
-#: What is measured nearer to it than this shows the surface, m.
-_ON_SURFACE_M = 0.006
 #: Corners nearer to the border of a region are of its outline, px.
 _BORDER_PX = 4
 #: A corner is on it that is nearer to one of its points than so many times their own distance, within these bounds.
@@ -121,7 +119,7 @@ class SegmentView:
         """Its surface taken along by a motion (4, 4), as far as that shows: as pairs."""
         p_cam = se3.transform(motion, self.surface.p_cam)
         uv_px = now.camera.project(p_cam)
-        shows = np.abs(now.depth_at(uv_px) - p_cam[:, 2]) < _ON_SURFACE_M
+        shows = np.abs(now.depth_at(uv_px) - p_cam[:, 2]) < self.surface.depth_m
         p_seg = se3.transform(se3.inverse(self.T_cam_seg), self.surface.p_cam[shows])
         return Matched(
             motion @ self.T_cam_seg, p_seg, uv_px[shows], p_cam[shows, 2], None, self.surface.cov_px2[shows], True
