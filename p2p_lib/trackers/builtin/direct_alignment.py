@@ -121,7 +121,7 @@ class Patch:
 
     def aligned(self, surface: Surface, motion: np.ndarray, level: int = 1) -> np.ndarray:
         """The motion (4, 4) of least cost near this one."""
-        return _aligned(np.ascontiguousarray(motion, float), *self._compared(surface, level), _STEPS)
+        return _aligned(np.ascontiguousarray(motion, float), *self._compared(surface, level))
 
     def _compared(self, surface: Surface, level: int) -> tuple[Any, ...]:
         own = surface.p_cam, surface.normals, surface.depth_m, surface.colours[level]
@@ -286,8 +286,8 @@ def _costs(motions, p_cam, normals, off_m, colours, image, depth_m, fx, fy, cx, 
     return costs
 
 
-@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8, i8")
-def _aligned(motion, p_cam, normals, off_m, colours, image, depth_m, fx, fy, cx, cy, steps):
+@compiled("f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f4[:,::1], f4[:,:,::1], f4[:,::1], f8, f8, f8, f8")
+def _aligned(motion, p_cam, normals, off_m, colours, image, depth_m, fx, fy, cx, cy):
     """Iteratively reweighted Gauss-Newton (Geman-McClure) on colours and on distances to the measured surface."""
     count, T, p, m, middle = len(p_cam), motion.copy(), np.zeros(3), np.zeros(3), np.zeros(3)
     here, right, left, below, above = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
@@ -295,7 +295,7 @@ def _aligned(motion, p_cam, normals, off_m, colours, image, depth_m, fx, fy, cx,
     for n in range(count):
         for i in range(3):
             mean[i] += p_cam[n, i] / count
-    for _ in range(steps):
+    for _ in range(_STEPS):
         for i in range(6):
             g[i] = 0.0
             for j in range(6):
