@@ -75,6 +75,24 @@ def test_points_and_normals_are_those_of_the_ball():
     )
 
 
+def plane(step_m: float = 0.0) -> Frame:
+    """All of one colour, at half a metre; its right half nearer by a step."""
+    depth_m = np.full(SHAPE, 0.5, np.float32)
+    depth_m[:, 160:] -= step_m
+    return Frame(0, 0.0, np.full((*SHAPE, 3), [150, 90, 60], np.uint8), depth_m)
+
+
+def test_normals_beside_a_step_are_of_its_own_side():
+    shown = surface(plane(step_m=0.05))
+    np.testing.assert_allclose(shown.normals, np.tile([0, 0, -1.0], (len(shown.normals), 1)), atol=1e-3)
+
+
+def test_what_nothing_tells_does_not_move():
+    there = se3.from_rt(np.eye(3), [0, 0, 0.002])
+    found = patch(plane()).aligned(surface(plane()), there)
+    assert np.abs(found - np.eye(4)).max() < 2e-4, "back onto the plane, and neither along it nor about its normal"
+
+
 def test_costs_are_those_of_their_definition():
     _, motion = turned(7)
     shown, now = surface(ball(START)), patch(ball(turned(5)[0]))
@@ -156,6 +174,7 @@ def test_what_is_before_it_does_not_count():
     frame = ball(T)
     frame.depth_m[:, 160:] -= np.where(frame.depth_m[:, 160:] > 0, 0.05, 0).astype(np.float32)
     frame.rgb[:, 160:] = [200, 150, 120]
+    assert patch(frame).costs(surface(ball(START)), motion[None])[0] < 0.45, "of what shows"
     assert apart_deg(patch(frame).aligned(surface(ball(START)), np.eye(4)), motion) < 1
 
 
@@ -194,6 +213,47 @@ def test_few_points_of_a_surface_say_nothing():
     shown = surface(ball(START))
     few = shown.select(np.arange(40))
     assert overruling(few, patch(ball(T)), [np.eye(4)], np.eye(4), 0.9, True) is None
+
+
+def shifted(m: float) -> np.ndarray:
+    return se3.from_rt(np.eye(3), [m, 0, 0])
+
+
+class Told:
+    """A patch that says at what cost a known motion, one near it and the best far one fit."""
+
+    def __init__(self, known: float, near: float, best: float):
+        self.fits, self.asked = {0.0: known, 0.01: near, 0.05: best}, False
+
+    def costs(self, surface, motions, level=1):
+        return np.array([self.fits[round(float(T[0, 3]), 3)] for T in motions])
+
+    def aligned(self, surface, motion, level=1):
+        return shifted(0.01)
+
+    def searched(self, surface, starts):
+        self.asked = True
+        return shifted(0.05)
+
+
+@pytest.mark.parametrize(
+    ("fits", "far", "known", "taken_m"),
+    [
+        ((0.5, 0.5, 0.2), False, True, None),  # points were followed, and nothing near is better
+        ((0.5, 0.5, 0.2), True, True, 0.05),  # few were
+        ((0.5, 0.3, 0.2), False, True, 0.05),  # something near is: they are wrong, so that there may be better yet
+        ((0.5, 0.3, 0.28), True, True, 0.01),  # hardly better: the nearer one is the likelier
+        ((0.1, 0.085, 0.01), False, True, None),  # nine tenths, but of little
+        ((0.1, 0.1, 0.01), True, True, None),  # good enough to look no farther
+        ((2.0, 1.2, 1.1), True, True, None),  # better than what is all wrong
+        ((2.0, 1.2, 0.95), True, False, None),  # nothing is known, and nothing is like it
+        ((2.0, 1.2, 0.85), True, False, 0.05),
+    ],
+)
+def test_what_counts_is_clearly_better_and_good(fits, far, known, taken_m):
+    shown = surface(ball(START))
+    motion = overruling(shown, Told(*fits), [np.eye(4)] if known else [], np.eye(4), 0.9, far)
+    assert (None if motion is None else round(float(motion[0, 3]), 3)) == taken_m
 
 
 @pytest.mark.parametrize(("share", "followed"), [(CFG.overruled_below, True), (0.0, False)])

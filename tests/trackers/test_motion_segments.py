@@ -11,7 +11,7 @@ from p2p_lib.trackers.builtin import motion_segments
 from p2p_lib.trackers.builtin.landmarks import Corners
 from p2p_lib.trackers.builtin.tracked_points import Points
 from p2p_lib.trackers.builtin.wide_baseline import Matched
-from tests.trackers.made_up import CAMERA, DEPTH_M, grid, image, shifted, started
+from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, shifted, started
 
 PX_M = DEPTH_M / CAMERA.fx  # one pixel on the plane
 LEFT, RIGHT = grid((40, 80), (80, 140), 12), grid((200, 250), (80, 140), 12)
@@ -241,3 +241,42 @@ def test_depth_of_another_surface_teaches_nothing():
     before = p.p_seg.copy()
     segments.update_positions(p, np.arange(len(p)), image(depth_m=DEPTH_M - 0.05))
     np.testing.assert_array_equal(p.p_seg, before)
+
+
+def overruled(monkeypatch, colours: bool, shift_px: float = 10) -> tuple[Points, motion_segments.MotionSegments]:
+    """Points that are followed where they were, of a surface that is said to have moved; it is grey without colours."""
+    p, segments = started(RIGHT, image())
+    look = image() if colours else image(np.full((*SHAPE, 3), 90, np.uint8))
+    segments.remember(p, look, None)
+    motion = np.eye(4)
+    motion[0, 3] = shift_px * PX_M
+    monkeypatch.setattr(motion_segments, "overruling", lambda *_: motion)
+    segments.fit(p, image())
+    return p, segments
+
+
+def moved_px(segments: motion_segments.MotionSegments) -> float:
+    (segment,) = segments.segments
+    return segment.fit.T_cam_seg[0, 3] / PX_M
+
+
+def test_points_that_are_overruled_do_not_hold_it_back(monkeypatch):
+    p, segments = overruled(monkeypatch, colours=True)
+    assert abs(moved_px(segments) - 10) < 0.5
+    p.verified[:] = True
+    segments.fit_found(p, image(), np.arange(len(p)), motion_segments.MIN_FOUND)
+    assert abs(moved_px(segments) - 10) < 0.5, "nor what is found afterwards"
+
+
+def test_where_colours_tell_little_points_have_their_say(monkeypatch):
+    _, segments = overruled(monkeypatch, colours=False, shift_px=2.5)
+    assert abs(moved_px(segments)) < 1
+
+
+@pytest.mark.parametrize(("field", "value"), [("rejected_for", 5), ("hidden_for", 9)])
+def test_what_was_refused_or_lost_for_long_is_not_aligned(field, value, monkeypatch):
+    p, segments = started(RIGHT, image())
+    segments.remember(p, image(), None)
+    setattr(segments.segments[0], field, value)
+    monkeypatch.setattr(motion_segments, "overruling", lambda *_: pytest.fail("aligned"))
+    segments.fit(p, image())

@@ -75,6 +75,8 @@ def test_corners_of_an_outline_do_not_count():
     found, _ = wide_baseline.corners_of([then], now, search)
     for at in (found.uv_px, then.corners.uv_px):
         assert len(at) and (np.abs(at - [159.5, 119.5]) < [67, 57]).all()
+    at = CAMERA.project(then.surface.p_cam)
+    assert len(at) > 200 and (np.abs(at - [159.5, 119.5]) < [69, 59]).all(), "nor does the surface at it"
 
 
 def test_what_is_before_it_is_not_of_it():
@@ -85,8 +87,19 @@ def test_what_is_before_it_is_not_of_it():
     depth[95:145, 135:185] -= 0.04
     segments.remember(p, image(depth_m=depth), None)
     (then,) = (segment.last_view for segment in segments.segments)
-    at = then.corners.p_cam
-    assert len(at) > 20 and at[:, 2].min() > DEPTH_M - 0.01
+    for at in (then.corners.p_cam, then.surface.p_cam):
+        assert len(at) > 20 and at[:, 2].min() > DEPTH_M - 0.01
+
+
+def test_what_is_hidden_is_not_carried_along():
+    p, segments = started(UV, image())
+    segments.remember(p, image(), None)
+    (then,) = (segment.last_view for segment in segments.segments)
+    depth = np.full(SHAPE, DEPTH_M, np.float32)
+    depth[:, 160:] -= 0.04
+    pairs = then.carried(np.eye(4), image(depth_m=depth))
+    assert len(pairs) > 100 and pairs.uv_px[:, 0].max() < 161
+    np.testing.assert_allclose(CAMERA.project(pairs.p_seg), pairs.uv_px, atol=0.01)
 
 
 def test_it_is_searched_for_where_depth_and_colour_fit():
