@@ -155,9 +155,9 @@ def test_what_lies_beside_counts_once_the_masks_are_settled_and_off_the_surface(
     """First masks may still grow; what is on the object's surface is of it, wherever the mask was."""
     told, inner = {}, following.by_geometry
 
-    def by_geometry_noted(patch, seeds, plane, config, motions=None, beside=None, free=None):
+    def by_geometry_noted(patch, seeds, plane, config, motions=None, beside=None, free=None, other=None):
         told[k] = None if beside is None else bool(beside.any())
-        return inner(patch, seeds, plane, config, motions, beside, free)
+        return inner(patch, seeds, plane, config, motions, beside, free, other)
 
     monkeypatch.setattr(following, "by_geometry", by_geometry_noted)
     segmenter = BuiltinSegmenter(CAMERA, CONFIG)
@@ -213,10 +213,11 @@ def test_where_the_wall_was_seen_through_it_is_not_the_object():
     elsewhere = Motions(now, both.recent, ((Frame(0, 0.0, *turned), both.recent[1]),))
     assert not free_before(patch, elsewhere).any()
     inner = cv2.erode(part.astype(np.uint8), np.ones((5, 5))) > 0
+    touched = plate | (np.arange(inner.size).reshape(inner.shape) == np.flatnonzero(inner)[0])
     for what, taken in ((both, True), (later, False)):
-        free = free_before(patch, what)
-        _, component = by_geometry(patch, plate, None, CONFIG, what, free=free)
-        assert component[plate].all() and component[inner].all() == component[inner].any() == taken
+        for seeds, motions, free in ((touched, None, free_before(patch, what)), (plate, what, None)):
+            _, component = by_geometry(patch, seeds, None, CONFIG, motions, free=free)
+            assert component[plate].all() and component[inner].all() == component[inner].any() == taken
 
 
 @pytest.mark.parametrize(

@@ -393,20 +393,31 @@ def test_what_nothing_else_tells_apart_stays_where_it_was():
 
 
 def test_a_side_that_comes_into_view_is_of_the_object():
-    """As plain as the wall beside it, and not there a frame ago: it hangs together with what was."""
+    """In a colour that nothing had, and not there a frame ago: it hangs together with what was."""
     at, follow = (120, 80), segmenter()
     side = np.roll(card(at), 60, 1) & (np.arange(320) < 190)
 
     def turned(k: int) -> Frame:
         frame = picture(k, [(at, 1)])
         if k:
-            frame.rgb[side], frame.depth_m[side] = (90, 90, 90), frame.depth_m[card(at)].mean()
-        frame.rgb[:, 240:] = 90
+            frame.rgb[side], frame.depth_m[side] = (200, 40, 200), frame.depth_m[card(at)].mean()
         return frame
 
     for k in range(8):
         found = follow.segment(turned(k), () if k else on(card=at)) == 1
     assert iou(found, card(at) | side) > 0.9 and found[side].mean() > 0.8
+
+
+@pytest.mark.parametrize("over_px", [0, 8, 15])
+def test_a_hand_that_takes_hold_of_an_object_is_not_of_it(over_px):
+    """It comes to the card, over some pixels of it or none, in the same depth, and stays; its colours are its own."""
+    at, follow = (100, 80), segmenter()
+    for k in range(14):
+        frame, left = picture(k, [(at, 2)]), max(240 - 10 * k, 160 - over_px)
+        hand = (np.arange(320) >= left) & (np.arange(320) < left + 15) & card((0, 85), (320, 40))
+        frame.rgb[hand], frame.depth_m[hand] = _print(5)[hand] // 8 + np.array((190, 130, 90), np.uint8), CARD_M
+        found = follow.segment(frame, () if k else on(card=at)) == 1
+    assert found[hand].mean() < 0.1 and iou(found, card(at) & ~hand) > 0.9
 
 
 def test_where_depth_jumped_the_mask_of_before_says_nothing():

@@ -67,13 +67,15 @@ def by_geometry(
     motions: Motions | None = None,
     beside: np.ndarray | None = None,
     free: np.ndarray | None = None,
+    other: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence that an object is connected in depth and is not what it stands on.
 
     seeds (h, w) bool lie on the object, ``plane`` (4,) may support it. Returns the log-odds (h, w) and the
     component (h, w) bool that is connected with the seeds, empty unless it looks like one object. Parts beside it
     that share its ``motions`` are added to it. What touches the seeds, but was seen a frame ago ``beside`` (h, w) bool
-    the object, or was ``free`` (h, w) bool before, is not of it.
+    the object, or was ``free`` (h, w) bool before, is not of it. What looks like something ``other`` (h, w) bool is
+    connected with nothing else.
     """
     log_odds, nothing = np.zeros(patch.shape, np.float32), np.zeros(patch.shape, bool)
     measured = patch.depth_m > 0
@@ -93,6 +95,10 @@ def by_geometry(
             log_odds[measured & low] -= config.geometry_weight
             smooth = smooth & ~low
     part = connected_components(smooth)
+    if other is not None:
+        part, apart = connected_components(smooth & ~other), connected_components(smooth & other)
+        part = np.where(apart > 0, apart + part.max(), part)
+        seeds = seeds & ~other
     component = components_touching(part, seeds)
     if beside is not None:
         component &= ~_mostly(part, beside)

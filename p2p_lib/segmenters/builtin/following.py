@@ -18,6 +18,8 @@ from p2p_lib.segmenters.builtin.view import Claim, View
 
 #: The flow is doubted if more of the mask jumped in depth, its area changed by more, or more of it lacks depth.
 _MAX_JUMPED, _MAX_AREA_CHANGE, _MAX_UNMEASURED = 0.03, 0.1, 0.25
+#: What has colours with lower log-odds than minus this looks like something else, as a hand that holds the object.
+_OTHER = 1.0
 #: Depth that returns after none of the object's was measured is its own within this distance of its last, m.
 _REAPPEARS_WITHIN_M = 0.1
 
@@ -90,13 +92,16 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
     plane = support_plane(patch, (patch.depth_m > 0) & (prior < 0.2))
     known = T_cam_obj is not None and target.past.full
     beside = predicted.beside & (surface <= 0) if known else None
-    log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside, free)
+    # Against what was beside it a frame ago: a side that comes into view may have colours that it has not shown yet.
+    colour = by_colour(patch, target.colours, predicted.beside & (prior < 0.2), cfg)
+    other = (surface <= 0) & (colour < -_OTHER * cfg.colour_weight)
+    log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside, free, other)
     stays = cfg.prior_weight * np.where(foreign | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
     # Parts that come into view are connected with those that were seen before.
     log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[foreign] -= cfg.geometry_weight
-    log_odds += by_colour(patch, target.colours, (prior < 0.2) & ~component, cfg) + surface
+    log_odds += by_colour(patch, target.colours, (prior < 0.2) & (~component | predicted.beside), cfg) + surface
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)

@@ -16,8 +16,9 @@ from p2p_lib.segmenters.builtin.patch import AT_THE_BORDER, Patch, dilated
 
 #: Two views of one point differ by less than this in colour, as a mean over the channels.
 _SAME_COLOUR = 40.0
-#: A part follows if more of it agrees with the object's motion, less with standing still; of a still scene more stays.
-_AGREES, _UNDECIDED, _STAYS = 0.75, 0.5, 0.7
+#: A part follows if more of it agrees with the object's motion, less with standing still, and something behind it was
+#: seen through less of it in any frame; of a still scene more stays.
+_AGREES, _UNDECIDED, _EMPTY, _STAYS = 0.75, 0.5, 0.3, 0.7
 #: A part of fewer cells of the grid proves nothing; one within so many cells of the object may belong to it.
 _FEWEST, _NEAR = 12, 4
 #: One frame in so many is remembered, and so many besides the first are kept.
@@ -146,7 +147,7 @@ def _camera_stayed(p_cam: np.ndarray, rgb: np.ndarray, camera: Camera, then: Fra
 
 
 def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, motions: Motions) -> np.ndarray:
-    """(h, w) bool: parts beside an object's component (h, w) bool that moved as it did and did not stay.
+    """(h, w) bool: parts beside an object's component (h, w) bool that moved as it did, did not stay and did not come.
 
     part  (h, w) int, see :func:`p2p_lib.segmenters.builtin.patch.connected_components`
     """
@@ -165,5 +166,9 @@ def parts_that_follow(patch: Patch, part: np.ndarray, component: np.ndarray, mot
     p_cam, rgb = patch.points()[v, u], patch.rgb[v, u]
     moved = agrees(p_cam, rgb, patch.camera, *motions.recent)
     stayed = agrees(p_cam, rgb, patch.camera, motions.recent[0], np.eye(4))
-    moved, stayed = (np.bincount(part[v, u], w, count) / np.maximum(size, 1) for w in (moved, stayed))
-    return (adjacent & (moved > _AGREES) & (stayed < _UNDECIDED))[part]
+    empty = np.zeros(len(v), bool)
+    for then, T_then_now in motions.compared:
+        _, behind_m, step_m = _looked_at(p_cam, patch.camera, then, T_then_now)
+        empty |= behind_m > step_m
+    moved, stayed, empty = (np.bincount(part[v, u], w, count) / np.maximum(size, 1) for w in (moved, stayed, empty))
+    return (adjacent & (moved > _AGREES) & (stayed < _UNDECIDED) & (empty < _EMPTY))[part]
