@@ -17,6 +17,7 @@ from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.method.refinement import surface_distance
+from p2p_lib.segmenters.builtin import following
 from p2p_lib.segmenters.builtin import segmenter as segmenter_page
 from p2p_lib.segmenters.builtin.colours import colour_codes, evidence, histogram
 from p2p_lib.segmenters.builtin.patch import (
@@ -406,6 +407,52 @@ def test_a_side_that_comes_into_view_is_of_the_object():
     for k in range(8):
         found = follow.segment(turned(k), () if k else on(card=at)) == 1
     assert iou(found, card(at) | side) > 0.9 and found[side].mean() > 0.8
+
+
+@pytest.mark.parametrize("on_surface", [True, False])
+def test_a_side_as_plain_as_the_wall_is_of_the_object_where_its_surface_is(on_surface):
+    """By its colours it is the wall, which is beside it and in the same depth; what is reconstructed tells better."""
+    at, follow = (120, 80), segmenter()
+    side = np.roll(card(at), 60, 1) & (np.arange(320) < 190)
+    surface_m = np.where(card(at) | (side & on_surface), 0, np.nan).astype(np.float32)
+    for k in range(8):
+        frame = picture(k, [(at, 1)])
+        if k:
+            frame.rgb[side], frame.depth_m[side] = (90, 90, 90), frame.depth_m[card(at)].mean()
+        frame.rgb[:, 240:] = 90
+        hints = {"card": Hint(np.zeros((0, 2)), surface_m)} if k else None
+        found = follow.segment(frame, () if k else on(card=at), hints) == 1
+    assert (found[side].mean() > 0.8) == on_surface
+
+
+def test_colours_are_compared_with_all_that_was_beside_it_connected_or_not(monkeypatch):
+    """Something in the card's own colours is connected with it as soon as it touches."""
+    at, follow, told, both = (100, 80), segmenter(), {}, 0
+
+    def noted(name):
+        inner = getattr(following, name)
+
+        def call(*asked, **more):
+            told[name] = asked, inner(*asked, **more)
+            return told[name][1]
+
+        monkeypatch.setattr(following, name, call)
+
+    for name in ("follow", "by_geometry", "by_colour"):
+        noted(name)
+    monkeypatch.setattr(segmenter_page, "follow", following.follow)
+    for k in range(14):
+        frame, left = picture(k, [(at, 2)]), max(240 - 10 * k, 160)
+        thing = (np.arange(320) >= left) & (np.arange(320) < left + 15) & card((0, 85), (320, 40))
+        frame.rgb[thing] = np.roll(_print(2), (80, left), (0, 1))[thing]
+        frame.depth_m[thing] = CARD_M
+        follow.segment(frame, () if k else on(card=at))
+        if "follow" in told:
+            predicted, (_, component) = told["follow"][0][-1], told["by_geometry"][1]
+            unlikely = component & predicted.beside & (predicted.prior < 0.2)
+            both += np.count_nonzero(unlikely)
+            assert told["by_colour"][0][2][unlikely].all()
+    assert both
 
 
 @pytest.mark.parametrize("over_px", [0, 8, 15])
