@@ -9,8 +9,8 @@ from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import joined
 from p2p_lib.trackers.builtin import motion_segments
 from p2p_lib.trackers.builtin.landmarks import Corners
+from p2p_lib.trackers.builtin.segment_view import Matched
 from p2p_lib.trackers.builtin.tracked_points import Points
-from p2p_lib.trackers.builtin.wide_baseline import Matched
 from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, shifted, started
 
 PX_M = DEPTH_M / CAMERA.fx  # one pixel on the plane

@@ -18,6 +18,7 @@ from the poses of these segments. A frame goes through it in this order (:mod:`p
    recognised and badly predicted are invisible.
 6. Update, every few frames: new templates, points assigned to segments, landmarks of sides not seen before.
 
-``tracked_points`` holds the arrays of all points, ``image`` what is computed once per frame. What the caller knows
-comes in by ``reject`` (these tracks contradict the rigid motion: a look-alike) and ``suggest`` (guided re-detection).
+``tracked_points`` holds the arrays of all points, ``image`` what is computed once per frame, ``segment_view`` what is
+kept of a segment from frame to frame. What the caller knows comes in by ``reject`` (these tracks contradict the rigid
+motion: a look-alike) and ``suggest`` (guided re-detection).
 """

@@ -18,9 +18,10 @@ from p2p_lib.trackers.builtin.direct_alignment import overruling
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Landmarks, corners
 from p2p_lib.trackers.builtin.rigid_motion import PointPrediction, PoseFit, fit_pose, pose_distance_m, predict
+from p2p_lib.trackers.builtin.segment_view import Matched, SegmentView
 from p2p_lib.trackers.builtin.tangent_planes import lifted_cov, planes_at
 from p2p_lib.trackers.builtin.tracked_points import Points
-from p2p_lib.trackers.builtin.wide_baseline import Matched, SegmentView, corners_of, matched
+from p2p_lib.trackers.builtin.wide_baseline import corners_of, matched
 
 #: Covariance of a pose that matches have proposed: rad, m.
 _PROPOSED_COV = np.diag(np.repeat([0.05, 0.004], 3) ** 2)

@@ -14,7 +14,7 @@ from p2p_lib.core.robust import consensus, refit, residual_m
 from p2p_lib.core.types import SHARED, Frame, Rows
 from p2p_lib.trackers.builtin.image import Image
 from p2p_lib.trackers.builtin.landmarks import Corners, alike, corners, described
-from p2p_lib.trackers.builtin.wide_baseline import inner
+from p2p_lib.trackers.builtin.segment_view import inner
 
 #: Corners that are described in a whole image, and in the mask of one object.
 _IN_IMAGE, _IN_MASK = 800, 300
