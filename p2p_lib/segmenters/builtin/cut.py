@@ -94,8 +94,9 @@ def by_geometry(
             low = height < min(above_m / 2, max_plane_height_m(sigma_m))
             log_odds[measured & low] -= config.geometry_weight
             smooth = smooth & ~low
-    part = connected_components(smooth)
-    if other is not None:
+    if other is None:
+        part = connected_components(smooth)
+    else:
         part, apart = connected_components(smooth & ~other), connected_components(smooth & other)
         part = np.where(apart > 0, apart + part.max(), part)
         seeds = seeds & ~other
