@@ -8,7 +8,7 @@ import pytest
 
 from p2p_lib.core.config import TrackingConfig
 from p2p_lib.core.types import Frame
-from p2p_lib.trackers.builtin import features, motion_segments, recognition, wide_baseline
+from p2p_lib.trackers.builtin import features, motion_segments, recognition, segment_view, wide_baseline
 from p2p_lib.trackers.builtin.landmarks import corners
 from p2p_lib.trackers.builtin.tracker import BuiltinTracker
 from tests.trackers.made_up import CAMERA, DEPTH_M, SHAPE, grid, image, started, texture
@@ -75,6 +75,27 @@ def test_corners_of_an_outline_do_not_count():
     found, _ = wide_baseline.corners_of([then], now, search)
     for at in (found.uv_px, then.corners.uv_px):
         assert len(at) and (np.abs(at - [159.5, 119.5]) < [67, 57]).all()
+
+
+def test_corners_that_a_search_has_found_are_not_looked_for_again(monkeypatch):
+    p, segments = started(UV, image())
+    segments.remember(p, image(), None)
+    (then,) = (segment.last_view for segment in segments.segments)
+    known = then.corners.select(np.arange(0, len(then.corners.uv_px), 2))
+    monkeypatch.setattr(segment_view, "corners", lambda *_: pytest.fail("looked for again"))
+    again = segment_view.SegmentView(then.image, then.uv_px, then.T_cam_seg, found=known)
+    np.testing.assert_array_equal(again.corners.uv_px, known.uv_px)
+
+
+def test_a_segment_whose_points_have_no_depth_has_no_corners():
+    p, segments = started(UV, image())
+    segments.remember(p, image(), None)
+    (then,) = (segment.last_view for segment in segments.segments)
+    depth = np.full(SHAPE, DEPTH_M, np.float32)
+    for u, v in np.rint(then.uv_px[1:]).astype(int):  # of one point alone it is measured
+        depth[max(v - 6, 0) : v + 7, max(u - 6, 0) : u + 7] = 0
+    here = segment_view.SegmentView(image(depth_m=depth), then.uv_px, then.T_cam_seg, found=then.corners)
+    assert len(then.corners.uv_px) and not len(here.corners.uv_px)
 
 
 def test_what_is_before_it_is_not_of_it():
