@@ -99,7 +99,7 @@ class Keeper:
 
         sequence  whose images are looked at; None where they are gone
         """
-        self.writer.info["doubts"] = list(self.doubts)
+        self.writer.info["doubts"] = [doubt.as_dict() for doubt in self.doubts]
         self.writer.flush()
         seen, looks = (Stream("", self.method.camera), 0) if sequence is None else (sequence, RUN_LOOKS)
         found = consistency(load_run(self.writer.path), seen, looks, self.sizes_m)
@@ -112,8 +112,8 @@ def noted(doubts: Doubts) -> Iterator[None]:
     shown = warnings.showwarning
 
     def note(message: Warning | str, category: type[Warning], *where: Any, **how: Any) -> None:
-        if issubclass(category, Doubt):
-            doubts.add(str(message))
+        if isinstance(message, Doubt):
+            doubts.add(message)
         shown(message, category, *where, **how)
 
     warnings.showwarning = note

@@ -138,7 +138,7 @@ def recall(method: Point2Pose, memories: Mapping[str, ObjectMemory], frozen: boo
         method.add_object(name, memory=memory, frozen=frozen)
         if fewer := far_fewer_pixels(memory, method.camera):
             fix = "All is metric and nothing is to be changed, but it is found near the learnt views alone."
-            doubt(f"memory of {name!r}", fewer, fix)
+            doubt(f"memory of {name!r}", fewer, fix, name)
 
 
 def evaluate_tracker(
@@ -307,11 +307,11 @@ def _doubt_range(job: _Job, frame: Frame, masks: Mapping[str, np.ndarray | None]
     out_m = {name: m for name, m in away_m.items() if uncounted({name: m}, limits)}
     told = out_m or (unknown if len(unknown) == len(away_m) else {})  # one that is far away beside others is
     if told and (wrong := beyond(told, limits, scale)):
-        doubt(f"depth of {next(iter(told))!r} in frame {frame.index}", *wrong)
+        doubt(f"depth of {next(iter(told))!r} in frame {frame.index}", *wrong, of=next(iter(told)))
         unknown = {name: m for name, m in unknown.items() if name not in told}
     for name, m in unknown.items():
         if wrong := odd_size(large[name], m, job.sequence.camera, scale):
-            doubt(f"size of {name!r} in frame {frame.index}", *wrong)
+            doubt(f"size of {name!r} in frame {frame.index}", *wrong, of=name)
     return set(away_m)
 
 

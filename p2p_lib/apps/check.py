@@ -150,8 +150,8 @@ def check_folder(
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
         if unit is None or np.isnan(distance_m(frame, mask)):
             findings.append(_range(name, frame, mask, config, scale))
-        warned = [str(of.message) for of in doubts if f"{name!r} in frame" in str(of.message)]
-        findings += [Finding(f"{name}: clicks", Level.LOOK, text) for text in warned]
+        said = [of.message for of in doubts if isinstance(of.message, Doubt) and of.message.object == name]
+        findings += [Finding(f"{name}: clicks", Level.LOOK, str(doubt)) for doubt in said]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
         findings += _misspelt(name, firsts)
     return findings if unit is None else _blamed(unit, findings)

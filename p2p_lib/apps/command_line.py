@@ -286,8 +286,8 @@ def open_page(url: str) -> bool:
 
 def _show_doubt(others: Callable, name: str, doubts: Doubts, message: Any, category: type, *where: Any) -> None:
     """A doubt is said once, however often it comes with other numbers; how often is said at the end."""
-    if not issubclass(category, Doubt):
+    if not isinstance(message, Doubt):
         others(message, category, *where)
         return
-    if doubts.add(str(message)):
+    if doubts.add(message):
         warn(f"p2p {name}: {message}")

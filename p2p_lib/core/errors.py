@@ -74,18 +74,32 @@ def advised(error: P2PError, fix: str) -> P2PError:
 
 
 class Doubt(UserWarning):
-    """What can be meant, and most often is not: tracking goes on."""
+    """What can be meant, and most often is not: tracking goes on.
+
+    object  that it is about; None: all that was read
+    kind    by which whoever does something about it knows it; empty where nobody does
+    """
+
+    def __init__(self, text: str, object: str | None = None, kind: str = ""):
+        super().__init__(text)
+        self.object, self.kind = object, kind
+
+    def as_dict(self) -> dict[str, str | None]:
+        """As ``run.json`` keeps it."""
+        return {"text": str(self), "object": self.object, "kind": self.kind}
 
 
-def doubt(name: str, got: object, fix: str) -> str:
+def doubt(name: str, got: object, fix: str, of: str | None = None, kind: str = "") -> str:
     """Warn of what came, saying what to do if it was not meant; the line named is the caller's of this library.
+
+    of, kind  object and kind of the :class:`Doubt`
 
     Returns what it says.
     """
     level, at = 2, sys._getframe(1)
     while at.f_back is not None and at.f_globals.get("__name__", "").startswith(("p2p_lib.", "contextlib")):
         level, at = level + 1, at.f_back
-    said = Doubt(_sentence(f"{name}: {got}", fix))
+    said = Doubt(_sentence(f"{name}: {got}", fix), of, kind)
     warnings.warn(said, stacklevel=level)
     return str(said)
 
@@ -95,12 +109,12 @@ class Doubts:
 
     def __init__(self) -> None:
         self._count: Counter[str] = Counter()
-        self._first: dict[str, str] = {}
+        self._first: dict[str, Doubt] = {}
 
-    def add(self, text: str) -> bool:
+    def add(self, doubt: Doubt) -> bool:
         """Whether it is the first of its kind."""
-        alike = re.sub(r"('[^']*')|\d+", lambda found: found[1] or "N", text)
-        self._first.setdefault(alike, text)
+        alike = re.sub(r"('[^']*')|\d+", lambda found: found[1] or "N", str(doubt))
+        self._first.setdefault(alike, doubt)
         self._count[alike] += 1
         return self._count[alike] == 1
 
@@ -109,11 +123,11 @@ class Doubts:
         """A line for each of which more came than the first."""
         return [f"{count - 1} more like: {alike}" for alike, count in self._count.items() if count > 1]
 
-    def __iter__(self) -> Iterator[str]:
+    def __iter__(self) -> Iterator[Doubt]:
         """The first of each kind; of those that came again it says how often."""
-        for alike, text in self._first.items():
+        for alike, first in self._first.items():
             more = self._count[alike] - 1
-            yield f"{text} ({more} more like it)" if more else text
+            yield Doubt(f"{first} ({more} more like it)", first.object, first.kind) if more else first
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:

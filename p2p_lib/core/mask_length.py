@@ -78,4 +78,4 @@ def doubt_growth(name: str, frame_index: int, length_m: float, before_m: np.ndar
         return ""
     got = f"its mask is {100 * length_m:.0f} cm long now, {factor:.1f} times as long as before"
     fix = "If it holds more than the object: negative clicks on what is not it, a box, or a painted mask."
-    return doubt(f"correction of {name!r} in frame {frame_index}", got, fix)
+    return doubt(f"correction of {name!r} in frame {frame_index}", got, fix, name)

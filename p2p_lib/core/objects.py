@@ -251,7 +251,7 @@ class Objects(ABC, Generic[FollowedT]):
         for name, error in refused.items():
             if name in self.segmenter.names:
                 what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
-                self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}")
+                self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}", name)
         taken = {name: prompt for name, prompt in prompts.items() if name not in refused}
         self._doubts |= {(name, frame.index): doubts.get(name, "") for name in taken}
         self.journal.corrected(frame.index, taken.keys() & set(self.segmenter.names))

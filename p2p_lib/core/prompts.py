@@ -118,7 +118,8 @@ def doubt_spelling(name: str, known: Collection[str]) -> None:
 
     called = {plain(other): other for other in known}
     if (like := called.get(plain(name))) and name not in known:
-        doubt(f"object {name!r}", f"another one than {like!r}, which is known", f"To correct that one, write {like!r}.")
+        got = f"another one than {like!r}, which is known"
+        doubt(f"object {name!r}", got, f"To correct that one, write {like!r}.", name)
 
 
 def check_apart(others: Iterable[Prompt], prompt: Prompt, where: str = "") -> None:
@@ -183,7 +184,7 @@ def given_masks(
         check_mask(name, prompt.mask, camera)
     for name, prompt in given.items():
         if prompt.mask is not None and prompt.mask.all():
-            doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?")
+            doubt(f"mask of {name!r}", f"the whole image in frame {frame.index}", "Is it inverted?", name)
     refused = {}
     for name, prompt in prompts.items():
         try:

@@ -31,7 +31,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, Doubt, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
 from p2p_lib.core.options import located
 from p2p_lib.core.paths import full
@@ -224,6 +224,12 @@ class Run:
     def __repr__(self) -> str:
         poses = ", ".join(f"{name} {obj.has_pose.sum()} of {len(obj)}" for name, obj in self.objects.items())
         return f"{type(self).__name__}({str(self.path)!r}, frames with a pose: {poses})"
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What was doubted while it was made; earlier versions wrote the text alone."""
+        said = self.info.get("doubts") or ()
+        return tuple(Doubt(of) if isinstance(of, str) else Doubt(**of) for of in said)
 
     def until(self, frame: int) -> Run:
         """The run as it was before a frame; :class:`BadInput` for one that has none before it, or was not reached."""

@@ -25,7 +25,7 @@ from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, suspicions
-from p2p_lib.extended.depth_lag import DIFFERENT_MOMENTS
+from p2p_lib.extended.depth_lag import DEPTH_MOVED
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -129,13 +129,12 @@ def consistency(
     masks, every = load_masks(run.path), load_run(run.path, every_map=True)
     sizes = {name: of.doubt for name, of in lengths(run.path, known_m or {}).items() if of.doubt}
     objects, found, unknown = {}, {}, {}
-    doubted = run.info.get("doubts") or ()
     for name, whole in run.objects.items():
         rows = whole.followed if whole.followed.any() else np.ones(len(whole), bool)
         obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
-        fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, doubted)
-        doubts = tuple(text for text in doubted if _is_about(text, name) and DIFFERENT_MOMENTS not in text)
+        fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, run.doubts)
+        doubts = tuple(str(of) for of in run.doubts if of.object in (None, name) and of.kind != DEPTH_MOVED)
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
         kept_of = masks.get(name), keypoints.get(name)
         evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved, bool(run.info.get("offline")))
@@ -156,12 +155,6 @@ def consistency(
             numbers["reprojection_px"] = _reprojection_px(obj, keypoints[name], sequence.camera)
         objects[name] = numbers
     return Consistency(objects, found, unknown, run.info, rate(run.timings)[0])
-
-
-def _is_about(doubt: str, name: str) -> bool:
-    """Whether what was doubted when a run was made is of an object, or of all that was read."""
-    subject = doubt.partition(":")[0]
-    return repr(name) in subject or "'" not in subject
 
 
 def _reprojection_px(obj: ObjectRun, points: ObjectKeypoints, camera: Camera) -> float:

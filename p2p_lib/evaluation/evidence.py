@@ -16,7 +16,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
-from p2p_lib.core.errors import MissingBackend
+from p2p_lib.core.errors import Doubt, MissingBackend
 from p2p_lib.core.image import in_mask, mask_iou
 from p2p_lib.core.mask_length import CELL_PX, CELLS
 from p2p_lib.core.raycasting import cast, ray_scene
@@ -60,7 +60,7 @@ def surface_in_view(
     mesh: Path,
     masks: ObjectMasks | None,
     looks: int,
-    doubts: Collection[str] = (),
+    doubts: Collection[Doubt] = (),
 ) -> SurfaceFit:
     """An object's surface at its poses, at every :data:`~p2p_lib.datasets.mask_log.CELLS` pixel of some frames.
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.depth_edges import brightness_edges, near_sides
+from p2p_lib.core.errors import Doubt
 from p2p_lib.core.types import Frame
 
 if TYPE_CHECKING:
@@ -36,8 +37,8 @@ _MIN_FIT, _MIN_GAIN = 0.3, 0.1
 #: A way that is too short to tell, as a fraction of the image's width; and an offset after which a camera is known to
 #: take the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
 _SHORT, _OFF = 0.005, 0.02
-#: How a run says, in its doubts, that it moves depth onto its colour.
-DIFFERENT_MOMENTS = "of different moments while the camera moves"
+#: The kind of doubt by which a run says that it moves depth onto its colour.
+DEPTH_MOVED = "depth moved"
 
 
 class DepthLag:
@@ -54,7 +55,7 @@ class DepthLag:
     @property
     def doubt(self) -> tuple[str, str]:
         """What is wrong with a camera that takes them apart, in words, and what to do."""
-        got = f"{DIFFERENT_MOMENTS}, {self.off_px:.0f} px apart"
+        got = f"of different moments while the camera moves, {self.off_px:.0f} px apart"
         return got, "Depth is moved onto colour from then on; poses are better of a camera that takes both together."
 
     def moved(self, frame: Frame) -> np.ndarray | None:
@@ -93,13 +94,13 @@ class DepthLag:
         return motion
 
 
-def as_the_run_took(sequence: Sequence, i: int, doubts: Iterable[str]) -> Frame:
+def as_the_run_took(sequence: Sequence, i: int, doubts: Iterable[Doubt]) -> Frame:
     """Frame i of a run's sequence, its depth moved onto its colour where the run had to do so.
 
-    doubts  of the run (``run.json``)
+    doubts  of the run
     """
     frame, lag = sequence.frame(i), DepthLag()
-    if not i or not any(DIFFERENT_MOMENTS in doubt for doubt in doubts):
+    if not i or not any(doubt.kind == DEPTH_MOVED for doubt in doubts):
         return frame
     lag.off_px = 1.0  # small offsets count, too
     lag.moved(sequence.frame(i - 1))

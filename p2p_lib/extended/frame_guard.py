@@ -10,7 +10,7 @@ import numpy as np
 from p2p_lib.core.depth import far_depth
 from p2p_lib.core.errors import doubt
 from p2p_lib.core.types import Frame
-from p2p_lib.extended.depth_lag import DepthLag
+from p2p_lib.extended.depth_lag import DEPTH_MOVED, DepthLag
 
 #: Depth, colour or both may repeat for so long, s: some cameras deliver one of them less often.
 _STANDS_S = 0.08
@@ -82,7 +82,7 @@ class FrameGuard:
         known, depth_m = self._lag.off_px, self._lag.moved(frame)
         if self._lag.off_px and not known:
             got, fix = self._lag.doubt
-            doubt("depth and colour", f"{got} in frame {frame.index}", fix)
+            doubt("depth and colour", f"{got} in frame {frame.index}", fix, kind=DEPTH_MOVED)
         return depth_m
 
     def _time_remark(self, frame: Frame) -> str:

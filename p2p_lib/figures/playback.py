@@ -126,7 +126,7 @@ class Playback:
         """The image of row i, where it can still be had."""
         if self.sequence is None:
             return None
-        return as_the_run_took(self.sequence, int(self.frame_index[i]), self.run.info.get("doubts") or ())
+        return as_the_run_took(self.sequence, int(self.frame_index[i]), self.run.doubts)
 
     def cloud(self, i: int, frame: Frame, points: int) -> tuple[np.ndarray, np.ndarray]:
         """About so many points (M, 3) of the frame of row i in camera coordinates, on a grid, and their colours (M, 3).

@@ -91,7 +91,7 @@ class Finished:
 
     def frame(self, i: int) -> Frame:
         """Image i of the sequence, its depth moved onto its colour where the run had to do so."""
-        return as_the_run_took(self.sequence, i, self.run.info.get("doubts", ()))
+        return as_the_run_took(self.sequence, i, self.run.doubts)
 
     @cached_property
     def _coarse(self) -> Mapping[str, Any]:

@@ -526,7 +526,7 @@ def test_depth_whose_scale_moves_is_doubted_before_anything_is_tracked(sequence,
     first = capsys.readouterr().err.splitlines()[0]
     said = r"depth: all depth changes by [67] % from frame \d to \d\. .* See p2p check"
     assert re.match(f"p2p run: {said}", first)
-    assert re.match(said, json.loads((tmp_path / "out/run.json").read_text())["doubts"][0])
+    assert re.match(said, json.loads((tmp_path / "out/run.json").read_text())["doubts"][0]["text"])
 
 
 def test_a_frame_that_cannot_be_read_ends_a_run_or_is_left_out_and_counted(sequence, tmp_path, capsys, monkeypatch):
@@ -1182,15 +1182,15 @@ def test_what_is_suspicious_is_said_at_the_end_kept_and_said_again(sequence, tmp
     assert run(sequence, out, *clicks(tmp_path, ("wall", 0, [[5, 5], [150, 110]]))) in (0, 2)
     said = capsys.readouterr().out
     told = json.loads((out / "run.json").read_text())
-    assert any("clicks on 'wall' in frame 0" in text for text in told["doubts"])
-    assert told["doubts"][0] in told["look_at"]["wall"]
+    assert any("clicks on 'wall' in frame 0" in of["text"] and of["object"] == "wall" for of in told["doubts"])
+    assert told["doubts"][0]["text"] in told["look_at"]["wall"]
     assert "What to look at before it is believed, by some of the images" in said
     assert all(f"  wall: {text}" in said for text in told["look_at"]["wall"])
     assert run(sequence, tmp_path / "fine", "--masks", "dataset") == 0
     assert "Nothing is suspicious by some of the images" in capsys.readouterr().out
     assert cli.main(["eval", str(out), "--json"]) == 0
     judged = json.loads(capsys.readouterr().out)["objects"]["wall"]
-    assert judged["verdict"] == "look" and told["doubts"][0] in [found["text"] for found in judged["look_at"]]
+    assert judged["verdict"] == "look" and told["doubts"][0]["text"] in [found["text"] for found in judged["look_at"]]
     both = clicks(tmp_path, ("wall", 0, [[5, 5], [150, 110]]), ("board", 0, [[64, 52]]))
     out = tmp_path / "both"
     assert run(sequence, out, *both) in (0, 2)
@@ -1396,5 +1396,6 @@ def test_a_doubt_that_repeats_is_said_once_with_its_count(tmp_path, capsys):
     said = [line for line in capsys.readouterr().err.splitlines() if "Is it inverted?" in line]
     whole = "mask of 'object': the whole image in frame"
     assert said == [f"p2p run: {whole} 0. Is it inverted?", f"p2p run: 5 more like: {whole} N. Is it inverted?"]
-    kept = [doubt for doubt in json.loads((tmp_path / "out/run.json").read_text())["doubts"] if "inverted" in doubt]
+    doubts = json.loads((tmp_path / "out/run.json").read_text())["doubts"]
+    kept = [of["text"] for of in doubts if "inverted" in of["text"]]
     assert kept == [f"{whole} 0. Is it inverted? (5 more like it)"], "nor does it fill the run's record"

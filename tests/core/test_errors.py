@@ -74,9 +74,11 @@ def test_what_is_meant_is_found_in_capitals_and_without(word, meant):
 
 def test_doubts_that_differ_in_numbers_are_one_but_not_those_of_other_names():
     doubts = Doubts()
-    told = [doubts.add(f"mask of {name!r} in frame {k}") for k in range(3) for name in ("object_1", "object_2")]
+    names = ("object_1", "object_2")
+    told = [doubts.add(Doubt(f"mask of {name!r} in frame {k}", name)) for k in range(3) for name in names]
     assert told == [True, True, False, False, False, False]
-    assert list(doubts) == [f"mask of 'object_{k}' in frame 0 (2 more like it)" for k in (1, 2)]
+    assert [str(of) for of in doubts] == [f"mask of 'object_{k}' in frame 0 (2 more like it)" for k in (1, 2)]
     assert doubts.more == [f"2 more like: mask of 'object_{k}' in frame N" for k in (1, 2)]
-    doubts.add("once")
-    assert list(doubts)[-1] == "once" and len(doubts.more) == 2
+    assert tuple(of.object for of in doubts) == names
+    doubts.add(Doubt("once"))
+    assert str(list(doubts)[-1]) == "once" and len(doubts.more) == 2

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from p2p_lib.core import se3
+from p2p_lib.core.errors import Doubt
 from p2p_lib.core.image import in_mask
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog, load_masks
@@ -14,6 +15,7 @@ from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
 from p2p_lib.datasets.runs import COLUMNS, NOT_FOLLOWED, load_run
 from p2p_lib.evaluation.consistency import HEADS, Consistency, consistency
 from p2p_lib.evaluation.evidence import on_surface
+from p2p_lib.extended.depth_lag import DEPTH_MOVED
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -65,12 +67,16 @@ def test_a_good_run_is_called_good_and_one_put_off_is_not(made, run):
 
 
 def test_what_was_doubted_when_it_was_made_is_to_be_looked_at(made, run):
-    doubts = ["clicks on 'box' in frame 0: 9 pixels, flat", "depth: all depth changes by 9 % from frame 3 to 4"]
-    moved = "depth and colour: of different moments while the camera moves, 14 px apart in frame 76. Depth is moved."
-    found = consistency(replace(run, info=run.info | {"doubts": [*doubts, moved]}), made.sequence)
-    assert [s.text for s in found.suspicions["box"]] == doubts and [s.text for s in found.suspicions["can"]] == doubts[
-        1:
-    ]
+    of_box, of_all = Doubt("the can's box: flat", "box"), Doubt("depth: all of it changes by 9 %")
+    doubts = [of.as_dict() for of in (of_box, of_all, Doubt("depth and colour: 14 px apart", kind=DEPTH_MOVED))]
+    found = consistency(replace(run, info=run.info | {"doubts": doubts}), made.sequence)
+    told = {name: [s.text for s in of] for name, of in found.suspicions.items()}
+    assert told == {"box": [str(of_box), str(of_all)], "can": [str(of_all)]}
+
+
+def test_doubts_of_earlier_versions_are_of_all_that_was_read(made, run):
+    told = consistency(replace(run, info=run.info | {"doubts": ["flat"]}), made.sequence).suspicions
+    assert [[s.text for s in told[name]] for name in ("box", "can")] == [["flat"], ["flat"]]
 
 
 def test_a_removed_object_is_no_lost_one(made, run, tmp_path):

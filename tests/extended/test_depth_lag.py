@@ -14,7 +14,7 @@ from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.evaluation.evidence import surface_in_view
 from p2p_lib.extended.default import compose
-from p2p_lib.extended.depth_lag import DepthLag
+from p2p_lib.extended.depth_lag import DEPTH_MOVED, DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.figures.playback import Playback
 from p2p_lib.offline.finished import Finished
@@ -127,14 +127,14 @@ class Film:
         return self.frames[i]
 
 
-SAID = [], ["depth and colour: of different moments while the camera moves, 9 px"]
+SAID = (), (Doubt("depth and colour", kind=DEPTH_MOVED),)
 
 
 @pytest.mark.parametrize("of", [Finished, lambda run, film: Playback(run, film, {})], ids=["offline", "drawn"])
 def test_what_is_made_or_drawn_of_a_run_takes_depth_as_the_run_did(of):
     for doubts, moved in zip(SAID, (False, True), strict=True):
         of_all = {"": SimpleNamespace(frame_index=np.arange(6))}
-        made = of(SimpleNamespace(info={"doubts": doubts}, objects=of_all), Film())
+        made = of(SimpleNamespace(doubts=doubts, objects=of_all), Film())
         for i, (frame, now) in enumerate(zip(Film.frames, Film.now, strict=True)):
             if moved and i:
                 assert wrong(made.frame(i).depth_m, now) < 0.25 * wrong(frame.depth_m, now)

@@ -184,7 +184,7 @@ def test_all_others_that_belong_to_what_is_clicked_are_named():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         segmenter().segment(picture(), prompts)
-    of_c = [str(doubt.message) for doubt in caught if "'c' in frame" in str(doubt.message)]
+    of_c = [str(doubt.message) for doubt in caught if doubt.message.object == "c"]
     assert [any(f"most of {other!r}" in text for text in of_c) for other in "ab"] == [True, True]
 
 

@@ -38,27 +38,27 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
         return doubt_nothing(cutter)
     if effect is Effect.MENDED:
         return _not_mended(cutter, mask)
-    frame, who = cutter.frame, _who(cutter)
+    frame, name, who = cutter.frame, cutter.prompt.name, _who(cutter)
     corners = ends_px(mask)
     patch = Patch.of(frame, around(corners.mean(0), np.ptp(corners, 0), frame.shape), cutter.camera, cutter.config)
     inside = (patch.down(mask.astype(np.float32)) > 0.5) & (patch.depth_m > 0)
     if _flat(patch, inside):
         got = f"the {np.count_nonzero(mask)} pixels selected lie in the plane around them, like a table or a wall"
         fix = "If this is not the object, click near its centre; if it is, check that depth is in metres."
-        return doubt(who, got, fix)
+        return doubt(who, got, fix, name)
     if one_body := _one_body(cutter, patch, inside, others):
         fix = "If they are one object, leave one out; else give each a negative click on the other."
-        return " ".join([doubt(who, f"the prompt selects most of {other!r}, too", fix) for other in one_body])
+        return " ".join([doubt(who, f"the prompt selects most of {other!r}, too", fix, name) for other in one_body])
     if (astray := _astray(cutter)) is not None:
         got = f"alone, the click at ({astray[0]}, {astray[1]}) selects something else than the others do"
-        return doubt(who, got, "If it is not on the object, leave it out, or make it a negative click.")
+        return doubt(who, got, "If it is not on the object, leave it out, or make it a negative click.", name)
     if (another := _as_good(cutter, mask, others)) is not None:
         pixels, (u, v) = another
         got = f"{np.count_nonzero(mask)} pixels selected; a mask of {pixels} fits as well"
         fix = f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it."
-        return doubt(who, got, fix)
+        return doubt(who, got, fix, name)
     if effect is Effect.BEGUN_ELSEWHERE:
-        return doubt(who, "they are farther from its mask than that is long", "It starts anew there.")
+        return doubt(who, "they are farther from its mask than that is long", "It starts anew there.", name)
     return ""
 
 
@@ -70,14 +70,14 @@ def _not_mended(cutter: Cutter, mask: np.ndarray) -> str:
         return ""
     (u, v), where = (missed[0], "outside") if len(missed) else (held[0], "inside")
     fix = "Click where it has depth and is one piece with the object, draw a box, or paint the mask."
-    return doubt(_who(cutter), f"({u:.0f}, {v:.0f}) is {where} its mask all the same", fix)
+    return doubt(_who(cutter), f"({u:.0f}, {v:.0f}) is {where} its mask all the same", fix, cutter.prompt.name)
 
 
 def doubt_nothing(cutter: Cutter, instead: str = "") -> str:
     """Warn that a prompt has selected nothing; ``instead`` says what its object has for a mask."""
     boxed = cutter.prompt.box_px is not None
     fix = "Click near its centre and on parts of other colours" + (", too." if boxed else ", or draw a box.")
-    return doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip())
+    return doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip(), cutter.prompt.name)
 
 
 def _who(cutter: Cutter) -> str:
