@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -47,6 +48,26 @@ def pytest_sessionfinish(session):
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     if os.environ.get("P2P_NO_SKIPS") and reporter and set(_skipped(reporter)) - {NO_GPU}:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_as_declared():
+    """Whatever the tests have met, no compiled function was called with types that it does not declare.
+
+    ``warm_up`` compiles the declared ones: another would stop the frame that first meets it for seconds.
+    """
+    yield
+    from p2p_lib.core import compiled
+
+    undeclared = []
+    for (module, name), arguments in compiled._arguments.items():
+        function = vars(sys.modules[module])[name] if module in sys.modules else None
+        if arguments and hasattr(function, "signatures"):
+            from numba.core.sigutils import normalize_signature
+
+            declared = {normalize_signature(f"({types},)")[0] for types in arguments}
+            undeclared += [f"{module}.{name}{types}" for types in set(function.signatures) - declared]
+    assert not undeclared, undeclared
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.depth import depth_noise_m
 from p2p_lib.core.robust import consensus
+from p2p_lib.trackers.builtin import rigid_motion
 from p2p_lib.trackers.builtin.rigid_motion import fit_pose, pose_distance_m, predict
 
 CAMERA = Camera(600, 610, 318, 242, 640, 480)
@@ -152,3 +153,16 @@ def test_depth_tells_the_range_better_than_pixels():
         fit = fit_pose(T, p_seg, np.zeros((len(z), 3, 3)), uv, cov, measured, CAMERA)
         range_sigma.append(np.sqrt(fit.covariance[5, 5]))
     assert range_sigma[0] < 0.5 * range_sigma[1]
+
+
+def test_it_is_compiled_once_however_its_arrays_lie_in_memory():
+    """Broadcast arrays, as of a segment that corners alone are matched of, are concatenated in any order."""
+    T, p_seg, p_cam = scene(1)
+    uv, cov, z = seen(p_cam, 1)
+    map_cov = np.zeros((len(z), 3, 3))
+    fit = fit_pose(T, p_seg, map_cov, uv, cov, z, CAMERA)
+    ready = set(rigid_motion._fit_pose.signatures)
+    other = [np.asfortranarray(of) for of in (p_seg, map_cov, uv, cov)]
+    again = fit_pose(T, *other, z, CAMERA)
+    np.testing.assert_array_equal(again.T_cam_seg, fit.T_cam_seg)
+    assert set(rigid_motion._fit_pose.signatures) == ready
