@@ -54,8 +54,11 @@ def with_mask(prompt: Prompt, made: Mapping[str, np.ndarray]) -> Prompt:
 
 def check_still(prompt: Prompt, then: Frame, now: Frame) -> None:
     """Refuse a prompt of an earlier frame where something has moved since."""
+    if then.index > now.index:
+        got, fix = f"frame {then.index}, which is newer", "Give the frame that they were made on, once it was tracked."
+        raise BadInput(f"prompt of {prompt.name!r}: frame", got, f"one before frame {now.index}", fix)
     if has_moved(prompt, then, now):
-        who, got = f"prompt of {prompt.name!r} in frame {then.index}", f"what has moved by frame {now.index}"
+        who, got = f"prompt of {prompt.name!r} in frame {then.index}", f"pixels that have changed by frame {now.index}"
         raise BadInput(who, got, "what stands still meanwhile", "Click again on a newer image.")
 
 

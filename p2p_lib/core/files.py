@@ -179,6 +179,8 @@ def replacing(path: Path, durable: bool = True) -> Iterator[BinaryIO]:
 
     durable  whether it is on the disk then, so that the computer may crash, too; that takes milliseconds
     """
+    if path.is_dir():
+        raise BadInput(str(path), "a folder", "a file to write")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

@@ -250,8 +250,7 @@ class Objects(ABC, Generic[FollowedT]):
         self._ignored = {}
         for name, error in refused.items():
             if name in self.segmenter.names:
-                what, got = f"correction of {name!r}", f"{error.name}: {error.got}"
-                self._ignored[name] = doubt(what, got, f"It is ignored. {error.fix}", name)
+                self._ignored[name] = doubt(f"correction of {name!r}", f"it is ignored: {error}", "", name)
         taken = {name: prompt for name, prompt in prompts.items() if name not in refused}
         self._doubts |= {(name, frame.index): doubts.get(name, "") for name in taken}
         self.journal.corrected(frame.index, taken.keys() & set(self.segmenter.names))
@@ -306,7 +305,8 @@ class Objects(ABC, Generic[FollowedT]):
             few = f": a mask of {pixels} pixels does not start it" * (estimate.reason == NOT_SEEN)
             self._unstarted[name] = estimate.reason + (f": {said}" if said else few)
         reason = self._reason(estimate, frame, mask, given is not None)
-        parts = (reason, grown, said * (estimate.T_cam_obj is not None), self._ignored.get(name, ""), frame.remark)
+        told = said if estimate.status is not Status.INITIALISING else ""  # there it is the reason
+        parts = (reason, grown, told, self._ignored.get(name, ""), frame.remark)
         return replace(estimate, reason="; ".join(filter(None, parts)))
 
     def _reason(self, estimate: PoseEstimate, frame: Frame, mask: np.ndarray | None, mask_given: bool) -> str:

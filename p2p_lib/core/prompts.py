@@ -255,7 +255,8 @@ def _box(what: str, given: Any) -> np.ndarray:
     except (TypeError, ValueError):
         box = np.zeros(0)
     if box.shape != (4,) or not np.isfinite(box).all() or box[0] >= box[2] or box[1] >= box[3]:
-        raise BadInput(what, repr(given)[:60], "[left, top, right, bottom] in pixels")
+        fix = "Of x, y, width, height give x, y, x + width, y + height." if box.shape == (4,) else ""
+        raise BadInput(what, repr(given)[:60], "[left, top, right, bottom] in pixels", fix)
     return box
 
 

@@ -52,6 +52,8 @@ _EVERY, _ENOUGH = 5, 60
 _LOOKS, _ALIKE_RAD, _FASTEST_M_S = 8, np.radians(25), 1.0
 #: A claim with fewer agreeing points is looked for anew, and withdrawn after so many looks in vain.
 _BARE, _PATIENCE = 4, 5
+#: Why it has no pose yet; and where it has a mask, as after clicks on it.
+_WAITS, _UNLIKE = "known from memory, not found yet", ": what is in its mask does not fit it so far"
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +254,7 @@ class Remembered(TwoMaps):
         """The object's pose at a frame; once it is followed, landmarks that have come into view are added."""
         given = obs.mask is not None and obs.given
         if not given and not (self._claimed and (obs.mask is not None or self.life.T_cam_obj is not None)):
-            return self.own.absent(obs, Verdict(False, Status.INITIALISING, "known from memory, not found yet"))
+            return self.own.absent(obs, Verdict(False, Status.INITIALISING, _WAITS + _UNLIKE * bool(obs.mask_px)))
         followed = int(np.isin(self.map.keys, self._key)[obs.seen].sum())
         step = super().step(obs)
         if step.estimate.T_cam_obj is not None:

@@ -5,6 +5,7 @@ Not in the paper. Nothing here is asked while frames are tracked, and no pose de
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, Self
 from p2p_lib import __version__
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import from_dict
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, in_a_line
 from p2p_lib.core.memory import ObjectMemory, camera_words, read_memories, save_memories, save_memory
 from p2p_lib.extended.remembered import Remembered
 from p2p_lib.extended.remembering import memory_of
@@ -76,10 +77,14 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
         """
         from p2p_lib.datasets.prompts import parse_prompts
 
+        if unknown := sorted(parts.keys() - set(_PARTS)):
+            fix = "Parameters are those that it was saved with." if unknown[0] == "config" else ""
+            raise BadInput("load", repr(unknown[0]), f"camera, {', '.join(_PARTS)}", fix)
         about, learnt = read_memories(path, _SAVED, _SAVED_BY)
         try:
             saved = {kind: about[kind] for kind in _PARTS}
-            camera, config = camera or Camera(**about["camera"]), from_dict(about["config"], str(path))
+            camera = Camera(**about["camera"]) if camera is None else camera
+            config = from_dict(about["config"], str(path))
             frozen = {name: bool(is_frozen) for name, is_frozen in about["objects"].items()}
         except (KeyError, TypeError, AttributeError):
             lacking = "a file that does not say with what camera, parameters, parts and objects"
@@ -106,6 +111,10 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
         """
         with self.alone():
             self._check_known("memory", name)
+            try:
+                json.dumps(made_of)
+            except TypeError as error:
+                raise BadInput("memory: made_of", in_a_line(error), "plain values: texts, numbers, lists") from None
             return memory_in(self.objects[name], self.objects[name].known.map_id, **made_of)
 
 

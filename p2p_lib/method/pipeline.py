@@ -24,6 +24,7 @@ from p2p_lib.core.config import Config, as_config
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.interfaces import Detector, PointTracker, Segmenter
 from p2p_lib.core.objects import FollowedT, Objects
+from p2p_lib.core.prompts import check_frame
 from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, PoseEstimate, Tracks
 from p2p_lib.method.frontend import FrameInputs, Frontend, Masks
@@ -124,8 +125,9 @@ class Point2Pose(Objects[FollowedT]):
 
     def _inputs(self, frame: Frame, masks: Mapping[str, np.ndarray | None]) -> FrameInputs:
         """The frame, every object's checked mask (None: the segmenter has to find it) and the prompts for it."""
-        given, prompts = self.take_prompts(frame, masks)
-        return FrameInputs(self._parts.before(frame) if self._parts.before else frame, given, prompts)
+        check_frame(frame, self.camera)
+        frame = self._parts.before(frame) if self._parts.before else frame
+        return FrameInputs(frame, *self.take_prompts(frame, masks))
 
     def finish(self) -> Iterator[dict[str, PoseEstimate]]:
         """After the last frame: the estimates still owed by a tracker that answers late, oldest first."""

@@ -83,9 +83,11 @@ def test_a_correction_of_an_earlier_frame_holds_where_nothing_has_moved():
         expected = (alone.step(third), alone.step(now))[1]["left"]
         for said in ({"clicks": clicks_on(masks["left"])}, {"mask": masks["left"]}):
             method.correct("left", **said, frame=third)
-        with pytest.warns(Doubt, match=r"correction of 'left'.* moved by frame 9\. It is ignored\. Click again on"):
+        with pytest.warns(
+            Doubt, match=r"correction of 'left': it is ignored: .* changed by frame 9, .* Click again on"
+        ):
             estimate = method.step(now)["left"]
-        assert "It is ignored. Click again on a newer image." in estimate.reason
+        assert "it is ignored: prompt of" in estimate.reason and "Click again on a newer image." in estimate.reason
         assert_same([{"left": replace(estimate, reason=expected.reason)}], [{"left": expected}])
 
 
@@ -123,3 +125,10 @@ def test_what_selected_nothing_in_an_earlier_frame_starts_nothing(monkeypatch):
 
 def test_a_mask_without_pixels_cannot_have_moved():
     assert not has_moved(Prompt("left", mask=np.zeros(THEN.shape, bool)), THEN, film()[9][0])
+
+
+def test_clicks_on_a_frame_that_comes_later_are_refused_as_such():
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("left", clicks=ON["left"], frame=seen_again(9, 9))
+        told = method.step(seen_again(3, 3))["left"]
+        assert "frame: got frame 9, which is newer, expected one before frame 3" in told.reason

@@ -447,6 +447,15 @@ def test_a_mask_of_something_else_founds_no_other_map(learnt, other):
     assert all(one.status is Status.LOST and one.map_id == 0 for one in told)
 
 
+def test_what_was_clicked_on_and_is_not_it_is_said_to_be_unlike_it(learnt, other):
+    method = Point2Pose(other.camera)
+    method.add_object("box", memory=learnt.memory)
+    said = [method.step(other.frame(0))["box"].reason]
+    method.correct("box", mask=other.masks(1)["mug"])
+    said += [method.step(other.frame(i))["box"].reason for i in (1, 2)]
+    assert said[0] == "known from memory, not found yet" and "does not fit it so far" in said[-1], said
+
+
 def test_few_landmarks_prove_nothing_on_what_does_not_end_where_depth_does():
     assert _certain(1, 0.9, 0.9, lambda: 0.6)
     assert not _certain(5, 0.9, 0.9, lambda: 0.3) and not _certain(5, 0.9, 0.9, lambda: None)

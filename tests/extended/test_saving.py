@@ -231,3 +231,15 @@ def test_a_run_says_of_which_object_too_little_was_learnt(tmp_path):
     method.add_object("never seen")
     saving.keep_memory(tmp_path / "never.npz", method.objects["never seen"], 0, info)
     assert list(info["without_map"]) == ["ball"], "of that one it is said that it never had a pose"
+
+
+def test_what_it_cannot_be_loaded_or_written_with_is_refused(saved, tmp_path):
+    with pytest.raises(BadInput, match=r"load: got 'config', expected camera, .*\. Parameters are those"):
+        saved(given={"config": "paper"})
+    with pytest.raises(BadInput, match="camera: got ndarray"):
+        saved(given={"camera": np.eye(3)})
+    with saved() as method:
+        with pytest.raises(BadInput, match="got a folder, expected a file"):
+            method.save(tmp_path)
+        with pytest.raises(BadInput, match=r"memory: made_of: got .*ndarray.*, expected plain values"):
+            method.memory("ball", where=np.zeros(3))

@@ -244,3 +244,27 @@ def test_what_was_doubted_is_forgotten_with_its_object(at):
         method.remove_object("wall")
         method.add_object("wall")
         assert method.step(then)["wall"].reason == "not seen yet: it waits for a mask (step) or for clicks (correct)"
+
+
+def test_clicks_in_a_frame_of_another_unit_stop_nobody():
+    """The others have their estimates, and the one that was clicked on says what was wrong."""
+    with Point2Pose(CAMERA, quick()) as method:
+        for frame, masks in film()[:2]:
+            method.step(frame, {"left": masks["left"]}) if method.objects else method.add_object("left")
+        (frame, masks), at = film()[2], np.argwhere(film()[2][1]["right"]).mean(0)[::-1]
+        method.add_object("right", clicks=[at])
+        told = method.step(replace(frame, depth_m=1000 * frame.depth_m), {"left": masks["left"]})
+    assert told["right"].status is Status.INITIALISING and "is it in millimetres?" in told["right"].reason
+    assert told["left"].T_cam_obj is None and "is it in millimetres?" in told["left"].reason
+
+
+@pytest.mark.filterwarnings("ignore::p2p_lib.core.errors.Doubt")
+def test_a_correction_of_what_is_hidden_is_answered_in_its_reason():
+    hidden, last = film(board=True), [*HIDDEN][-1]
+    with Point2Pose(CAMERA, quick()) as method:
+        method.add_object("left", mask=hidden[0][1]["left"])
+        for frame, _ in hidden[:last]:
+            method.step(frame)
+        method.correct("left", negative=[[160, 20]])
+        estimate = method.step(hidden[last][0])["left"]
+    assert estimate.status is Status.OCCLUDED and "negative clicks on 'left'" in estimate.reason

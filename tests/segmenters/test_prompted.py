@@ -532,3 +532,31 @@ def test_a_click_that_the_mask_goes_against_all_the_same_is_named(recwarn):
     assert "(40, 35) is outside its mask all the same" in doubt_prompt(cutter, LEFT, {}, Effect.MENDED)
     cutter.prompt = Prompt("left", 1, [[110, 100]], [[100, 90]])
     assert "(100, 90) is inside its mask all the same" in doubt_prompt(cutter, LEFT, {}, Effect.MENDED)
+
+
+@pytest.mark.parametrize(
+    ("was", "say", "match"),
+    [
+        (
+            WALL,
+            {"box_px": (85, 75, 155, 145)},
+            "box around 'left' in frame 1: nothing of its mask is inside. It starts",
+        ),
+        (LEFT, {"box_px": (85, 75, 155, 145)}, None),
+        (
+            None,
+            {"negative_px": [[175, 110]]},
+            "negative clicks on 'left' in frame 1: it has no mask .* Click on it, too",
+        ),
+    ],
+    ids=["a box beside it", "a box around it", "negative clicks while it is away"],
+)
+def test_a_correction_that_begins_elsewhere_or_takes_from_nothing_says_so(was, say, match):
+    follow = segmenter()
+    follow.segment(picture(0), [Prompt("left", mask=LEFT if was is None else was)])
+    if was is None:
+        follow.segment(picture(0), [Prompt("left", mask=np.zeros_like(LEFT))])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        follow.segment(picture(1), [Prompt("left", 1, **say)])
+    assert [bool(re.match(match or "", str(doubt.message))) for doubt in caught] == [True] * bool(match)

@@ -202,7 +202,10 @@ class Cutter:
         return Effect.MENDED if mends or not self.prompt.starts else Effect.BEGUN
 
     def _leaves(self, was: np.ndarray) -> bool:
-        """Whether a mask (H, W) bool is farther from every positive click than it is long: it is of something else."""
+        """Whether a mask (H, W) bool is of something else: clicks are farther away than it is long, a box beside it."""
+        if self.prompt.box_px is not None:
+            left, top, right, bottom = self.prompt.box_px.round().astype(int).clip(0).tolist()
+            return not was[top : bottom + 1, left : right + 1].any()
         clicks, ends = self.prompt.points_px, ends_px(was)
         away = np.maximum(np.maximum(ends[0] - clicks, clicks - ends[1] + 1), 0)
         return bool(len(clicks) and np.linalg.norm(away, axis=1).min() > np.ptp(ends, 0).max())

@@ -58,7 +58,9 @@ def doubt_prompt(cutter: Cutter, mask: np.ndarray, others: Mapping[str, np.ndarr
         fix = f"If pixel ({u}, {v}) is on the object, click on it, too; else give a negative click on it."
         return doubt(who, got, fix, name)
     if effect is Effect.BEGUN_ELSEWHERE:
-        return doubt(who, "they are farther from its mask than that is long", "It starts anew there.", name)
+        boxed = cutter.prompt.box_px is not None
+        got = "nothing of its mask is inside" if boxed else "they are farther from its mask than that is long"
+        return doubt(who, got, "It starts anew there.", name)
     return ""
 
 
@@ -76,12 +78,16 @@ def _not_mended(cutter: Cutter, mask: np.ndarray) -> str:
 def doubt_nothing(cutter: Cutter, instead: str = "") -> str:
     """Warn that a prompt has selected nothing; ``instead`` says what its object has for a mask."""
     boxed = cutter.prompt.box_px is not None
+    if not cutter.prompt.starts:
+        got, fix = "it has no mask that they could be taken from", "Click on it, too."
+        return doubt(_who(cutter), got, f"{instead} {fix}".strip(), cutter.prompt.name)
     fix = "Click near its centre and on parts of other colours" + (", too." if boxed else ", or draw a box.")
     return doubt(_who(cutter), "no object was found there", f"{instead} {fix}".strip(), cutter.prompt.name)
 
 
 def _who(cutter: Cutter) -> str:
-    what = "clicks on" if len(cutter.prompt.points_px) else "box around"
+    what = "box around" if cutter.prompt.starts else "negative clicks on"
+    what = "clicks on" if len(cutter.prompt.points_px) else what
     return f"{what} {cutter.prompt.name!r} in frame {cutter.frame.index}"
 
 

@@ -60,8 +60,10 @@ def fit_pose(
     centre = p_seg.mean(0)
     start = np.ascontiguousarray(T_cam_seg[:3, :3]), T_cam_seg[:3, :3] @ centre + T_cam_seg[:3, 3]
     # Concatenated from broadcast ones they are not contiguous, for which it would be compiled anew.
-    points = map(np.ascontiguousarray, (p_seg - centre, map_cov, uv_px, cov_px2, z_m, depth_noise_m(z_m)))
-    R, at, H, chi2, chi2_z = _fit_pose(*start, *points, camera.fx, camera.fy, camera.cx, camera.cy)
+    map_cov, uv_px, cov_px2 = (np.ascontiguousarray(each) for each in (map_cov, uv_px, cov_px2))
+    seen = uv_px, cov_px2, z_m, depth_noise_m(z_m)
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    R, at, H, chi2, chi2_z = _fit_pose(*start, np.ascontiguousarray(p_seg - centre), map_cov, *seen, *intrinsics)
     agrees = (chi2 < _AGREES_CHI2) & (chi2_z < _AGREES_DEPTH_CHI2)
     return PoseFit(se3.from_rt(R, at - R @ centre), np.linalg.inv(H), centre, agrees)
 
