@@ -343,13 +343,17 @@ def test_a_kernel_that_dies_is_a_failure(tmp_path):
     [
         (
             {"parameters": {"SED": 1}},
-            "00_a parameter: got SED, expected one of PROFILE, SEED, SCALE, NAME. Did you mean",
+            "00_a parameter: got SED, expected one of SEED, SCALE, NAME. Did you mean SEED?",
         ),
         ({"parameters": {"SEED": "many"}}, "00_a parameter SEED: got 'many', expected int like 0"),
         ({"parameters": {"SEED": True}}, "00_a parameter SEED: got True, expected int like 0"),
         ({"parameters": {"NAME": 3}}, "00_a parameter NAME: got 3, expected str like 'a'"),
         ({"profile": "fast"}, "profile: got 'fast', expected one of quick, full"),
-        ({"parameters": {"sed": 1}, "only": ["0"]}, "00_a parameter: got sed, expected one of PROFILE, SEED"),
+        ({"parameters": {"sed": 1}, "only": ["0"]}, "00_a parameter: got sed, expected one of SEED, SCALE"),
+        (
+            {"parameters": {"PROFILE": "huge"}},
+            "parameter: got PROFILE, expected one of a notebook's others. The profile is chosen by --profile",
+        ),
         ({"only": ["07"]}, "notebook: got '07', expected one of 00_a, 01_b"),
         ({"jobs": 0}, "jobs: got 0, expected at least 1"),
     ],
@@ -384,7 +388,7 @@ def test_what_runs_with_other_values_goes_beside_and_not_over(tmp_path, monkeypa
 def test_a_parameter_must_be_known_to_all_notebooks_that_run(tmp_path):
     write(tmp_path / "00_a.ipynb")
     write(tmp_path / "01_b.ipynb", parameters="PROFILE = 'quick'")
-    with pytest.raises(BadInput, match=r"01_b parameter: got SEED, expected one of PROFILE\. Pick the"):
+    with pytest.raises(BadInput, match=r"01_b parameter: got SEED, expected none: it has none\. Pick the"):
         run_notebooks(out=tmp_path / "out", folder=tmp_path, parameters={"SEED": 1}, say=lambda line: None)
 
 
