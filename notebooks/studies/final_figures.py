@@ -179,10 +179,10 @@ def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure
         dots = uv_px, overlay.value_colours(error_px, 0, FAR_PX)
         images.append(scene.draw(row, scene.region(), 420, axes=False, trail=0, dots=dots))
     high_in = WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
-    figure, axes = panels(count, (WIDTH_IN, high_in + 0.6), side_by_side=True)
+    figure, axes = panels(count, (WIDTH_IN, high_in + 0.9), side_by_side=True)
     for axis, image, row in zip(axes, images, rows, strict=True):
         axis.imshow(image)
-        axis.set_title(f"ADD {1e3 * worst_m[row]:.1f} mm", fontsize=9)
+        axis.set_title(f"ADD {1e3 * worst_m[row]:.3g} mm", fontsize=9)
         axis.set_axis_off()
     colours = ScalarMappable(Normalize(0, FAR_PX), "cividis")
     bar = figure.colorbar(colours, ax=axes, location="bottom", aspect=60, pad=0.02, extend="max")
