@@ -264,7 +264,9 @@ class SelectionConfig(_Checked):
         " best supported one is selected unless the surface prefers another significantly.",
         choices=("surface", "support"),
     )
-    surface_sigmas: float = _p(5.0, "The surface must prefer another one by so many standard errors.", low=0)
+    surface_sigmas: float = _p(
+        5.0, "The surface must prefer another one, that no keypoints agree with, by so many standard errors.", low=0
+    )
 
 
 @dataclass(frozen=True)
