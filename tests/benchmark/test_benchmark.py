@@ -333,7 +333,8 @@ def test_sigterm_ends_the_command_itself_and_nothing_is_left(plan, tmp_path):
         time.sleep(0.01)
     ran.send_signal(signal.SIGTERM)
     out, err = ran.communicate(timeout=300)  # the end of its output is that of all its processes
-    assert ran.returncode == 128 + signal.SIGTERM and err.splitlines()[-1] == "p2p benchmark: interrupted", err
+    goes_on = f"p2p benchmark: interrupted. Go on with it: p2p benchmark {plan} --out {tmp_path}"
+    assert ran.returncode == 128 + signal.SIGTERM and err.splitlines()[-1] == goes_on, err
     assert "semaphore" not in err and "Traceback" not in err
     assert 1 <= len(list(tmp_path.glob("records/*.json"))) < 8 and " 0 failed, " in out
 
@@ -348,7 +349,9 @@ def test_an_interrupted_plan_replaces_no_table_that_was_made(plan, tmp_path, mon
     table.parent.mkdir()
     table.write_text("as it was")
     assert cli.main(["benchmark", str(plan), *options, "--tables", str(table.parent)]) == 130
-    assert table.read_text() == "as it was" and "2 not run" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert table.read_text() == "as it was" and "2 not run" in out and f"not run yet: p2p benchmark {plan}" in out
+    assert err.endswith(f"Go on with it: p2p benchmark {plan} --out {tmp_path} --quick\n")
 
 
 def test_interrupted_figures_say_so_and_draw_nothing(tmp_path, monkeypatch, capsys):
