@@ -47,6 +47,17 @@ def _offered(group: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=group)}
 
 
+def loaded(kind: str) -> Iterator[tuple[str, Any]]:
+    """What installed packages offer of a kind, by name; what cannot be loaded is left out, and doubted."""
+    for name, point in offered(kind).items():
+        try:
+            yield name, _theirs(kind, name, point.value)
+        except Exception as error:  # noqa: BLE001 what a package of somebody else's raises says nothing of what is asked
+            package = point.dist.name if point.dist else "an installed package"
+            fix = f"It is left out: mend {package}, or uninstall it."
+            doubt(f"{_SAID.get(kind, kind)} {name!r}, offered by {package}", in_a_line(error), fix)
+
+
 def knows(kind: str, name: str, known: Iterable[str]) -> bool:
     """Whether a name stands for a part."""
     return name in known or is_place(name) or name in offered(kind)

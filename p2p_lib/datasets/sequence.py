@@ -21,7 +21,7 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, doubt, in_a_line
 from p2p_lib.core.paths import data_dir
-from p2p_lib.core.plugins import find, offered
+from p2p_lib.core.plugins import find, loaded
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.images import NOT_RIGID, called_otherwise, gaps_allowed
 
@@ -378,7 +378,7 @@ def _layout(folder: Path) -> str | None:
 
     def tried() -> Iterator[tuple[str, tuple[str, ...]]]:
         yield from ((name, patterns) for name, patterns in FORMATS.items() if name not in _PLAIN)
-        yield from ((name, getattr(_loader(name), "patterns", ())) for name in offered("dataset"))
+        yield from ((name, getattr(load, "patterns", ())) for name, load in loaded("dataset") if name not in FORMATS)
         yield from ((name, FORMATS[name]) for name in _PLAIN)
 
     return next((name for name, patterns in tried() if any(next(folder.glob(p), None) for p in patterns)), None)
