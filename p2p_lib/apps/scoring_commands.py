@@ -210,6 +210,8 @@ def _benchmark(a: argparse.Namespace) -> int:
             print(words, flush=True)
         return 0
     if a.stale:
+        if a.quick:
+            raise BadInput("benchmark", "--stale with --quick", "one of them", "What is stale is made anew in full.")
         return _stale(a)
     if a.present and not (present := present_plans()):
         warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")

@@ -295,6 +295,8 @@ def test_a_part_whose_methods_are_called_otherwise_is_refused_before_anything_ru
 def test_a_near_name_is_one_that_can_be_called(theirs):
     with pytest.raises(BadInput, match=r"something called load_it in their_parts. Did you mean their_parts:load\?"):
         make_tracker("their_parts:load_it", preset().tracking)
+    with pytest.raises(BadInput, match=r"something called Nope in their_parts\. It has Mine, Dots, Cutter, .* more\.$"):
+        make_tracker("their_parts:Nope", preset().tracking)
     (theirs / "their_parts.py").write_text("import numpy as nq")
     sys.modules.pop("their_parts")
     with pytest.raises(BadInput, match=r"something called nd in their_parts$"):
