@@ -235,8 +235,8 @@ def _benchmark(a: argparse.Namespace) -> int:
             made["commit"] = next((str(outcome.ran.get("commit")) for _, outcome in done), None)
             save_table(paper_table(benchmark), benchmark.plan.name, sources=[benchmark], parameters=made, to=a.tables)
     if any(benchmark.interrupted for benchmark in benchmarks):
-        words = [*map(str, a.plan), "--out", str(a.out), *["--quick"] * a.quick]
-        raise KeyboardInterrupt(f"Go on with it: p2p benchmark {shlex.join(words)}")
+        again = shlex.join([*map(str, a.plan), "--out", str(a.out), *["--quick"] * a.quick])
+        raise KeyboardInterrupt(f"Go on with it: p2p benchmark {again}")
     ended = [benchmark.counts() for benchmark in benchmarks]
     if failed := sum(count["failed"] for count in ended):
         warn(f"p2p benchmark: {failed} runs failed; the tables say why. --retry tries them again.")

@@ -1,13 +1,15 @@
 """The runs that a plan asks for, each known by a key: a hash of all that decides its result.
 
 That is every parameter with the seed, tracker, detector and source of masks, the sequence, and the library's own
-source. Equal keys are one run, whichever plans ask for it. What is on disk under a key is never computed again.
+source with that of the modules of others that are named (not of what these import). Equal keys are one run, whichever
+plans ask for it. What is on disk under a key is never computed again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -185,7 +187,7 @@ def _keyed(job: Job, config: Config, known: dict[tuple, tuple[str, Sequence]]) -
             "prompts": [[p.as_dict(), "" if p.mask is None else _sha(p.mask.tobytes())] for p in job.prompts],
             "chamfer": job.chamfer,
             "min_visible_px": job.min_visible_px,
-        }
+        } | _others(method, planned)
     except P2PError as error:
         if isinstance(error, BadInput) and planned.name.startswith(SYNTHETIC):
             raise  # the plan's mistake; of files, it is theirs
@@ -275,6 +277,17 @@ def _fingerprint(job: Job, known: dict[tuple, tuple[str, Sequence]]) -> Any:
         known[key] = _files_hash(job)
     _check_objects(job, known[key][1].objects)
     return known[key][0]
+
+
+def _others(method: Method, planned: PlannedSequence) -> dict[str, Any]:
+    """Hashes of the modules in which named parts of others are, which have been loaded; nothing where all are ours."""
+    named = {"tracker": method.tracker, "detector": method.detector, "dataset": planned.format}
+    named["segmenter"] = RunOptions(masks=method.masks).mask_source().segmenter
+    offered = {kind: plugins.offered(kind).get(name) for kind, name in named.items()}
+    places = [point.value if (point := offered[kind]) else name for kind, name in named.items()]
+    modules = [sys.modules.get(place.partition(":")[0]) for place in places if plugins.is_place(place)]
+    files = [module.__file__ for module in modules if module is not None and module.__file__]
+    return {"others": [_sha(Path(file).read_bytes()) for file in files]} if files else {}
 
 
 def _check_objects(job: Job, known: Iterable[str]) -> None:

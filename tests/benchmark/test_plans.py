@@ -329,6 +329,18 @@ def test_a_sequence_that_cannot_be_scored_or_has_no_such_object_says_so(tmp_path
         assert "truth: got T_cam_model (6, 4, 4), labelled (5,)" in reasons(format=own)[0]
 
 
+def test_a_changed_tracker_of_ones_own_is_another_run(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code = tmp_path / "my_changing_tracker.py"
+    code.write_text("def made(config, rng): ...\n")
+    small = SMALL.replace('"a"', '"synthetic/mug"').replace('"Ours"', '"Ours"\ntracker = "my_changing_tracker:made"')
+    (tmp_path / "small.toml").write_text(small)
+    (before,), (same,) = (jobs_of(read_plan(tmp_path / "small.toml"), "full") for _ in range(2))
+    code.write_text("def made(config, rng): return 1\n")
+    (after,) = jobs_of(read_plan(tmp_path / "small.toml"), "full")
+    assert before.key == same.key != after.key
+
+
 def test_a_plan_may_do_without_a_quick_profile_which_is_then_refused(tmp_path):
     (tmp_path / "small.toml").write_text(re.sub(r"(?s)\[quick\].*(?=\[full\])", "", SMALL))
     plan = read_plan(tmp_path / "small.toml")
