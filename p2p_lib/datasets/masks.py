@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, did_you_mean
 from p2p_lib.core.options import MASK_SOURCES
 from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
 
@@ -61,7 +61,8 @@ def find_masks(
     images, or a single one, of the first image.
     """
     if not folder.is_dir():
-        fix = f"Name a folder inside the sequence, a path, or {', '.join(MASK_SOURCES)}."
+        fix = f"Name a folder inside the sequence, a path, or {', '.join(dict.fromkeys(MASK_SOURCES))}."
+        fix = did_you_mean(folder.name, MASK_SOURCES) or fix
         raise MissingData(str(folder), "no such folder of masks", fix)
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
     names = objects or below

@@ -75,7 +75,7 @@ def test_results_in_full_are_shown_and_the_quick_form_runs_where_there_are_none(
     assert [b.profile for b in full.values()] == ["full"]
     nothing = load_benchmark(plan, tmp_path)
     assert nothing.counts() == {"done": 0, "failed": 0, "not run": 8}
-    assert {outcome.reason for _, outcome in nothing.results} == {"not run yet: p2p benchmark slides"}
+    assert {outcome.reason for _, outcome in nothing.results} == {f"not run yet: p2p benchmark {plan}"}
     assert not any(tmp_path.iterdir()), "looking leaves nothing behind"
     (unasked,) = final_figures.results_to_show([name], tmp_path, "quick", []).values()
     assert unasked.counts() == {"done": 0, "failed": 0, "not run": 2}
