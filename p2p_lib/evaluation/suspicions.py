@@ -87,9 +87,8 @@ class RunEvidence:
 
     @property
     def usual_m(self) -> float:
-        """The length of what masks hold that the image does not cut; of all, where it cuts all."""
-        whole = self.seen & ~self.cut
-        return median_of_known(self.size_m[whole if np.isfinite(self.size_m[whole]).any() else self.seen])
+        """The length of what masks hold that the image does not cut; NaN where it cuts all."""
+        return median_of_known(self.size_m[self.seen & ~self.cut])
 
     @property
     def carried(self) -> np.ndarray:

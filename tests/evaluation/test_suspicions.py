@@ -141,4 +141,4 @@ def test_what_the_image_cuts_is_not_the_usual_length():
     half = with_some(spotless(), 0.7, size_m=0.07)
     assert [s.rule for s in suspicions(half)] == ["grown"]
     assert not suspicions(replace(half, cut=half.size_m < 0.1))
-    assert not suspicions(replace(spotless(), cut=ROWS >= 0))
+    assert not suspicions(replace(half, cut=ROWS >= 0)), "of what is cut everywhere no length is usual"
