@@ -23,12 +23,9 @@ from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.evaluation.consistency import consistency
+from p2p_lib.evaluation.consistency import LOOKS, consistency
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.extended.saving import keep_memory
-
-#: Frames whose images are looked at when a run is judged at its end; ``p2p eval`` looks at more.
-RUN_LOOKS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +98,7 @@ class Keeper:
         """
         self.writer.info["doubts"] = [doubt.as_dict() for doubt in self.doubts]
         self.writer.flush()
-        seen, looks = (Stream("", self.method.camera), 0) if sequence is None else (sequence, RUN_LOOKS)
+        seen, looks = (Stream("", self.method.camera), 0) if sequence is None else (sequence, LOOKS)
         found = consistency(load_run(self.writer.path), seen, looks, self.sizes_m)
         self.writer.info["look_at"] = {name: [why.text for why in of] for name, of in found.suspicions.items()}
 

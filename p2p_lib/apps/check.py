@@ -24,7 +24,7 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import Config, preset
 from p2p_lib.core.errors import BadInput, Doubt, MissingData, P2PError, did_you_mean, listed
 from p2p_lib.core.findings import Finding, Level
-from p2p_lib.core.mask_length import doubt_growth, mask_length_m
+from p2p_lib.core.mask_length import doubt_growth, mask_length_m, whole_length_m
 from p2p_lib.core.options import lengths_m
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.core.types import Frame, evenly
@@ -424,8 +424,8 @@ def _doubt_boxes(sequence: Sequence, prompts: Iterable[Prompt], firsts: FirstMas
         if not said or prompt.frame <= firsts[prompt.name][0].index:
             continue
         (later,) = clicked_masks(sequence, [prompt], config).values()
-        first_m, later_m = (mask_length_m(*of, sequence.camera) for of in (firsts[prompt.name], later))
-        doubt_growth(prompt.name, prompt.frame, later_m, np.array([first_m]))
+        first_m = whole_length_m(*firsts[prompt.name], sequence.camera)
+        doubt_growth(prompt.name, prompt.frame, mask_length_m(*later, sequence.camera), np.array([first_m]))
 
 
 def _misspelt(name: str, firsts: FirstMasks) -> list[Finding]:

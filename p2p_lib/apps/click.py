@@ -28,7 +28,7 @@ from p2p_lib.core.config import Config, preset
 from p2p_lib.core.earlier import selected
 from p2p_lib.core.errors import BadInput, Doubt, P2PError
 from p2p_lib.core.files import parse_json
-from p2p_lib.core.mask_length import doubt_growth, mask_length_m
+from p2p_lib.core.mask_length import doubt_growth, mask_length_m, whole_length_m
 from p2p_lib.core.prompts import Prompt, check_depth
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.mask_log import load_masks
@@ -143,8 +143,9 @@ class Clicker(AbstractContextManager):
     def _before_m(self, name: str, frame: Frame, kept: np.ndarray) -> np.ndarray:
         """Lengths of an object's masks before a frame of the run, m; without a run that of the mask that is kept."""
         if (log := load_masks(self.run.path).get(name) if self.run else None) is not None:
-            return log.size_m[log.frame_index < frame.index]
-        return np.array([mask_length_m(frame, kept, self.sequence.camera)])
+            whole_m = np.where(log.at_the_border(self.sequence.camera), np.nan, log.size_m)
+            return whole_m[log.frame_index < frame.index]
+        return np.array([whole_length_m(frame, kept, self.sequence.camera)])
 
     def checked(self, content: object, started: Iterable[str] = ()) -> tuple[Prompt, ...]:
         """The prompts that the page sends; objects that are ``started`` may be corrected alone."""

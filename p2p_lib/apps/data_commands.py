@@ -33,7 +33,7 @@ def _click(a: argparse.Namespace) -> None:
     from p2p_lib.datasets.runs import load_run
     from p2p_lib.datasets.sequence import open_sequence
 
-    sequence = open_sequence(a.sequence, a.format, a.depth_scale, gaps=a.run is not None)  # which it left out
+    sequence = open_sequence(a.sequence, a.format, a.depth_scale, gaps=True)  # p2p run --skip-bad needs prompts, too
     shown = load_run(a.run) if a.run is not None else None
     if shown is not None and (of := shown.info["sequence"]) != sequence.name:
         warn(f"p2p click: {a.run} is a run of {of}, not of {sequence.name}: is it the right one?")

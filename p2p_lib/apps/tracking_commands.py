@@ -111,10 +111,10 @@ def _run(a: argparse.Namespace) -> int:
     known_m = lengths_m(options.sizes, options.sizes or ())
     print("\n".join([*result.summary, *that_fit(lengths(a.out, known_m)), *_without_map(a.out)]))
     if result.look_at:
-        title = "What to look at before it is believed, by some of the images (p2p eval takes more of them):"
+        title = "What to look at before it is believed, by some of the images:"
         print("\n".join([title, *(f"  {line}" for line in said_once(result.look_at))]))
     elif result.tracked:
-        print("Nothing is suspicious by some of the images (p2p eval takes more of them).")
+        print("Nothing is suspicious by some of the images.")
     first = a.out / FIRST_MASKS
     results = f"Results in {a.out}" + f", first masks in {first}" * first.is_file()
     if result.evaluation is not None:

@@ -27,6 +27,12 @@ def mask_length_m(frame: Frame, mask: np.ndarray, camera: Camera) -> float:
     return length_and_middle(measured_in(frame, mask, camera))[0]
 
 
+def whole_length_m(frame: Frame, mask: np.ndarray, camera: Camera) -> float:
+    """The same, and NaN, too, where the mask reaches the image's border, which may cut what it holds."""
+    cut = any(side.any() for side in (mask[:CELL_PX], mask[-CELL_PX:], mask[:, :CELL_PX], mask[:, -CELL_PX:]))
+    return float("nan") if cut else mask_length_m(frame, mask, camera)
+
+
 def measured_in(frame: Frame, mask: np.ndarray, camera: Camera) -> np.ndarray:
     """(N, 3) what was measured of a mask at the pixels :data:`CELLS`."""
     at = np.argwhere(mask[CELLS])
@@ -47,7 +53,7 @@ def length_and_middle(p_cam: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 class UsualLengths:
-    """How long what each object's masks hold usually is; tells a correction that makes it much longer."""
+    """How long what each object's masks hold uncut usually is; tells a correction that makes it much longer."""
 
     def __init__(self, camera: Camera):
         self._camera = camera
@@ -62,9 +68,10 @@ class UsualLengths:
         before_m = self._lengths_m.setdefault(name, deque(maxlen=_LENGTHS))
         if mask is None or not (prompted or frame.index % _MEASURED == 0 or not before_m):
             return ""
-        length_m = mask_length_m(frame, mask, self._camera)
-        said = doubt_growth(name, frame.index, length_m, np.array(before_m)) if prompted else ""
-        before_m.append(length_m)
+        said = ""
+        if prompted:
+            said = doubt_growth(name, frame.index, mask_length_m(frame, mask, self._camera), np.array(before_m))
+        before_m.append(whole_length_m(frame, mask, self._camera))
         return said
 
 

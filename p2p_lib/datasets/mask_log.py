@@ -52,10 +52,10 @@ class ObjectMasks:
         return np.concatenate([[0], np.cumsum(-(-self.box[:, 2:].astype(int).prod(1) // 8))])
 
     def at_the_border(self, camera: Camera) -> np.ndarray:
-        """(n,) bool: the mask reaches the image's border, so that something of its object may be beyond."""
+        """(n,) bool: the mask ends at the image's border, or a cell before, for more may be beyond."""
         low, high = self.box[:, :2], self.box[:, :2] + self.box[:, 2:]
         ends = -(-np.array([camera.height, camera.width]) // CELL_PX)
-        return ((low == 0) | (high == ends)).any(1) & (self.px > 0)
+        return ((low <= 1) | (high >= ends - 1)).any(1) & (self.px > 0)
 
     def row(self, frame: int) -> int | None:
         """Which of the n a frame is; None where no mask was known."""

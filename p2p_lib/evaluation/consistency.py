@@ -21,7 +21,7 @@ from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen_if_there
-from p2p_lib.evaluation.evidence import ON_M, gathered, reprojected, surface_in_view
+from p2p_lib.evaluation.evidence import ON_M, depth_as_taken, gathered, reprojected, surface_in_view
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, suspicions
@@ -30,7 +30,7 @@ from p2p_lib.extended.depth_lag import DEPTH_MOVED
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: Frames that are looked at, evenly spread over the run.
+#: Frames that are looked at, evenly spread over the run: at its end the same as in ``p2p eval``, which say the same.
 LOOKS = 60
 #: What the numbers are called, and what they say.
 HEADS = {
@@ -129,15 +129,16 @@ def consistency(
     masks, every = load_masks(run.path), load_run(run.path, every_map=True)
     sizes = {name: of.doubt for name, of in lengths(run.path, known_m or {}).items() if of.doubt}
     objects, found, unknown = {}, {}, {}
+    measured_m = depth_as_taken(sequence, run.doubts, looks) if sequence is not None else None
     for name, whole in run.objects.items():
         rows = whole.followed if whole.followed.any() else np.ones(len(whole), bool)
         obj, of_every_map = whole.select(rows), every.objects[name].select(rows)
         mesh = run.path / "meshes" / f"{name}.ply"
-        fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, run.doubts)
+        fit = surface_in_view(obj, sequence, mesh, masks.get(name), looks, measured_m)
         doubts = tuple(str(of) for of in run.doubts if of.object in (None, name) and of.kind != DEPTH_MOVED)
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
         kept_of = masks.get(name), keypoints.get(name)
-        evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved, bool(run.info.get("offline")))
+        evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved)
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
         if obj.has_pose.any() and not evidence.compared:

@@ -5,8 +5,9 @@ Nothing here judges; :mod:`p2p_lib.evaluation.suspicions` does.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -60,14 +61,14 @@ def surface_in_view(
     mesh: Path,
     masks: ObjectMasks | None,
     looks: int,
-    doubts: Collection[Doubt] = (),
+    measured_m: Callable[[int], np.ndarray] | None,
 ) -> SurfaceFit:
     """An object's surface at its poses, at every :data:`~p2p_lib.datasets.mask_log.CELLS` pixel of some frames.
 
-    doubts  of the run: depth is looked at where the run moved it to
+    measured_m  the depth there of a frame by its number, :func:`depth_as_taken`
     """
     fit = SurfaceFit(*np.full((3, len(obj)), np.nan))
-    if sequence is None or not looks or not mesh.is_file():
+    if sequence is None or measured_m is None or not looks or not mesh.is_file():
         return fit
     try:
         scene, shape = ray_scene(*load_mesh(mesh)), (sequence.camera.height, sequence.camera.width)
@@ -77,13 +78,22 @@ def surface_in_view(
         if not obj.has_pose[row]:
             continue
         index = int(obj.frame_index[row])
-        depth_m = as_the_run_took(sequence, index, doubts).depth_m[CELLS]
+        depth_m = measured_m(index)
         surface_m = drawn_m(scene, sequence.camera, obj.T_cam_obj[row], CELLS)
         fit.on_surface[row], fit.through[row] = on_surface(surface_m, depth_m), _through(surface_m, depth_m)
         at = masks.row(index) if masks is not None else None
         if masks is not None and at is not None:
             fit.overlap[row] = _overlap(surface_m, depth_m, masks.cells(at, shape))
     return fit
+
+
+def depth_as_taken(sequence: Sequence, doubts: Collection[Doubt], looks: int) -> Callable[[int], np.ndarray]:
+    """What gives (h, w) metres at every :data:`~p2p_lib.datasets.mask_log.CELLS` pixel of a frame, each read once.
+
+    doubts  of the run: depth is where the run moved it to
+    looks   frames that are kept
+    """
+    return lru_cache(looks)(lambda i: as_the_run_took(sequence, i, doubts).depth_m[CELLS].copy())
 
 
 def gathered(
@@ -95,14 +105,12 @@ def gathered(
     fit: SurfaceFit,
     doubts: tuple[str, ...],
     moved: Collection[int] = (),
-    offline: bool = False,
 ) -> RunEvidence:
     """All that is known of one object, frame by frame.
 
     every   the same object with the poses of all its maps
     doubts  what was doubted of it when the run was made
     moved   frames whose pose an offline pass has moved far
-    offline whether its poses are that pass's
     """
     n = len(obj)
     px, size_m, cut, apart = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool), 0.0
@@ -121,7 +129,7 @@ def gathered(
     seen, inside, off_px, jump_px = of_points
     compared = seen, inside, off_px, jump_px, fit.overlap, fit.through, fit.on_surface
     far = np.isin(obj.frame_index, list(moved))
-    return RunEvidence(*of_poses, px, size_m, cut, *compared, far, doubts, apart, offline)
+    return RunEvidence(*of_poses, px, size_m, cut, *compared, far, doubts, apart)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

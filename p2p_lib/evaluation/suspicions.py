@@ -30,9 +30,9 @@ OVERLAP, THROUGH, ON_SURFACE = 0.5, 0.1, 0.6
 APART = 0.1
 #: Away for good is so much of the end of a run, at least so many frames; away too long, so much of all.
 _GONE_FRAMES, _GONE_SHARE, _AWAY_SHARE = 30, 0.1, 0.5
-#: So few frames may be chance, however short the run.
+#: So few frames may be chance, however short the run; of two in a row, one pair is none.
 _CHANCE = 2
-#: Stretches of frames that are named.
+#: Stretches of frames that are named, the worst first.
 _NAMED = 3
 
 
@@ -58,7 +58,6 @@ class RunEvidence:
     moved         (n,) bool: by an offline pass, more than three sigmas from the causal pose
     doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
-    offline       whether an offline pass made the poses, which are to be labels
     """
 
     frame_index: np.ndarray
@@ -78,7 +77,6 @@ class RunEvidence:
     moved: np.ndarray
     doubts: tuple[str, ...] = ()
     apart: float = 0.0
-    offline: bool = False
 
     @property
     def seen(self) -> np.ndarray:
@@ -87,9 +85,8 @@ class RunEvidence:
 
     @property
     def usual_m(self) -> float:
-        """The length of what masks hold that the image does not cut; of all, where it cuts all."""
-        whole = self.seen & ~self.cut
-        return median_of_known(self.size_m[whole if np.isfinite(self.size_m[whole]).any() else self.seen])
+        """The length of what masks hold that the image does not cut; NaN where it cuts all."""
+        return median_of_known(self.size_m[self.seen & ~self.cut])
 
     @property
     def carried(self) -> np.ndarray:
@@ -113,13 +110,19 @@ class Suspicion:
 
 @dataclass(frozen=True)
 class _Rule:
-    """Frames ``against`` an object, among those that ``count``: too many are more than ``limit`` (a share)."""
+    """Frames ``against`` an object, among those that ``count``: too many are more than ``limit`` (a share).
+
+    worse  how bad each frame is, to name the worst
+    row    of those that count so many in a row have to be against it
+    """
 
     name: str
     text: str
     limit: float
     against: Callable[[RunEvidence], np.ndarray]
     count: Callable[[RunEvidence], np.ndarray]
+    worse: Callable[[RunEvidence], np.ndarray] = lambda e: np.ones(len(e.frame_index))
+    row: int = 1
 
 
 def _known(key: str) -> Callable[[RunEvidence], np.ndarray]:
@@ -156,14 +159,23 @@ _RULES = (
         0.25,
         lambda e: e.off_px > OFF_PX,
         _known("off_px"),
+        lambda e: e.off_px,
     ),
-    _Rule("jumps", "the pose jumps, the keypoints do not", 0.02, lambda e: e.jump_px > JUMP_PX, _known("jump_px")),
+    _Rule(
+        "jumps",
+        "the pose jumps, the keypoints do not",
+        0.02,
+        lambda e: e.jump_px > JUMP_PX,
+        _known("jump_px"),
+        lambda e: e.jump_px,
+    ),
     _Rule(
         "silhouette",
         f"silhouette and mask overlap by less than {OVERLAP:g} (IoU)",
         0.2,
         lambda e: e.overlap < OVERLAP,
         _known("overlap"),
+        lambda e: 1 - e.overlap,
     ),
     _Rule(
         "seen through",
@@ -171,13 +183,16 @@ _RULES = (
         0.5,
         lambda e: e.through > THROUGH,
         _known("through"),
+        lambda e: e.through,
     ),
     _Rule(
         "off the surface",
-        f"depth lies on less than {100 * ON_SURFACE:.0f} % of the surface in view",
-        0.5,
+        f"a sure pose, and depth lies on less than {100 * ON_SURFACE:.0f} % of the surface in view",
+        0.0,
         lambda e: e.on_surface < ON_SURFACE,
-        _known("on_surface"),
+        lambda e: (e.confidence > DOUBTED) & np.isfinite(e.on_surface),
+        lambda e: ON_SURFACE - e.on_surface,
+        row=2,
     ),
     _Rule(
         "moved",
@@ -187,18 +202,12 @@ _RULES = (
         lambda e: e.has_pose,
     ),
     _Rule(
-        "labels",
-        "a sure offline pose that silhouette or depth contradicts",
-        0.2,
-        lambda e: contradicted(e.overlap, e.on_surface),
-        lambda e: (e.confidence > DOUBTED) & (np.isfinite(e.overlap) | np.isfinite(e.on_surface)) & e.offline,
-    ),
-    _Rule(
         "grown",
         f"the mask spans more than {GROWN:g} times the object's usual length",
         0.05,
         lambda e: e.size_m > GROWN * e.usual_m,
         lambda e: e.seen & np.isfinite(e.size_m),
+        lambda e: e.size_m,
     ),
 )
 
@@ -211,10 +220,10 @@ def suspicions(e: RunEvidence) -> tuple[Suspicion, ...]:
     found += [s for s in (_absent(e), _size(e)) if s is not None]
     for rule in _RULES:
         count = rule.count(e)
-        wrong = count & rule.against(e)
-        if wrong.sum() > max(rule.limit * count.sum(), _CHANCE):
+        wrong = _in_a_row(count & rule.against(e), count, rule.row)
+        if wrong.sum() > max(rule.limit * count.sum(), _CHANCE // rule.row):
             share = f"in {100 * wrong.sum() / count.sum():.0f} % of the frames"
-            found.append(_suspicion(rule.name, f"{rule.text} ({share})", e, wrong, count))
+            found.append(_suspicion(rule.name, f"{rule.text} ({share})", e, wrong, count, rule.worse(e)))
     return tuple(found)
 
 
@@ -243,13 +252,39 @@ def _size(e: RunEvidence) -> Suspicion | None:
     return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
 
 
-def _suspicion(rule: str, text: str, e: RunEvidence, wrong: np.ndarray, count: np.ndarray | None = None) -> Suspicion:
-    """One of frames ``wrong`` (n,) bool; those between two of them that do not ``count`` are named with them."""
-    at = np.flatnonzero(wrong if count is None else count)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong[at], [False]]).astype(int)))
-    ends = [(int(e.frame_index[at[a]]), int(e.frame_index[at[b - 1]])) for a, b in edges.reshape(-1, 2)]
-    longest = sorted(sorted(ends, key=lambda end: end[0] - end[1])[:_NAMED])
-    named = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in longest)
+def _suspicion(
+    rule: str,
+    text: str,
+    e: RunEvidence,
+    wrong: np.ndarray,
+    count: np.ndarray | None = None,
+    worse: np.ndarray | None = None,
+) -> Suspicion:
+    """One of frames ``wrong`` (n,) bool; those between two of them that do not ``count`` are named with them.
+
+    worse  (n,) how bad each is: where not all stretches are named, these are the worst, and the worst comes first
+    """
+    ends = _stretches(wrong, np.ones(len(wrong), bool) if count is None else count)
+    if len(ends) > _NAMED:
+        bad = wrong.astype(float) if worse is None else np.where(wrong, worse, 0)
+        ends.sort(key=lambda end: -bad[end[0] : end[1] + 1].sum())
+    of = [tuple(e.frame_index[list(end)].tolist()) for end in ends[:_NAMED]]
+    named = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in of)
     left = len(ends) - _NAMED
     more = f" and {left} more stretch{'es' * (left > 1)}" if left > 0 else ""
     return Suspicion(rule, f"{text}: frames {named}{more}", tuple(e.frame_index[wrong].tolist()))
+
+
+def _stretches(wrong: np.ndarray, count: np.ndarray) -> list[tuple[int, int]]:
+    """The first and the last row of each stretch of ``wrong`` (n,) bool among those that ``count`` (n,) bool."""
+    at = np.flatnonzero(count)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong[at], [False]]).astype(int)))
+    return [(int(at[a]), int(at[b - 1])) for a, b in edges.reshape(-1, 2)]
+
+
+def _in_a_row(wrong: np.ndarray, count: np.ndarray, least: int) -> np.ndarray:
+    """(n,) bool: those ``wrong`` of which at least so many that ``count`` follow each other."""
+    kept = np.zeros(len(wrong), bool)
+    for first, last in _stretches(wrong, count):
+        kept[first : last + 1] = wrong[first : last + 1].sum() >= least
+    return kept & wrong

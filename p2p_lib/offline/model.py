@@ -26,6 +26,7 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, evenly
 from p2p_lib.datasets.images import save_png
+from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.offline import holes, texture
 from p2p_lib.offline.finished import Finished, Renderer, new_folder
 
@@ -41,6 +42,8 @@ _HULL_FACES = 256
 #: A mask's pixels are beside a model if farther from it than this share of the mask's size; if more than so many are,
 #: a part is missing. (A real mug without its handle: 4 to 5 %; 45 other objects of 22 runs: at most 1.7 %.)
 _BESIDE, _MISSING = 0.03, 0.025
+#: Of poses so many of which are doubted a model may have parts twice, whose surface was fused at them.
+_OFTEN_DOUBTED = 0.2
 #: The edge of a texture, px, at least and at most, and the room around its charts.
 TEXTURE_PX, _GUTTER_PX = (512, 2048), 2
 
@@ -118,8 +121,8 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     about |= {"masks_beside": round(off_model, 4), "collision_faces": len(hull.faces)}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     guessed = f", {100 * about['guessed_share']:.0f} % of its area unseen, guessed" if shape.guessed.any() else ""
-    textured_of = f"texture of {len(views)} view{'s' * (len(views) != 1)}"
-    line = f"{name}: {len(shape.faces)} faces, {textured_of}{guessed}{no_better(off)}{lacks(off_model)}"
+    textured_of = f"{len(shape.faces)} faces, texture of {len(views)} view{'s' * (len(views) != 1)}"
+    line = f"{name}: {often_doubted(obj)}{textured_of}{guessed}{no_better(off)}{lacks(off_model)}"
     return line + how_open(about["parts"], about["holes"], about["largest_hole_m"], bool(made.about.get("offline")))
 
 
@@ -163,6 +166,16 @@ def beside(made: Finished, name: str, rows: np.ndarray, render: Renderer) -> flo
         away_px = cv2.distanceTransform((~shown).astype(np.uint8), cv2.DIST_L2, 5)
         found.append(np.count_nonzero(mask & (away_px > reach_px)) / np.count_nonzero(mask))
     return float(np.median(found[1:] or found))
+
+
+def often_doubted(obj: ObjectRun) -> str:
+    """What there is to say, before anything else, of a model that was made of poses which are often doubted."""
+    share = float(obj.doubted.sum() / obj.has_pose.sum())
+    if share < _OFTEN_DOUBTED:
+        return ""
+    median = np.median(obj.confidence[obj.has_pose])
+    doubted = f"{100 * share:.0f} % of the run's poses are doubted (median confidence {median:.2f})"
+    return f"{doubted}, parts of it may be doubled or out of place: p2p eval says where to look; "
 
 
 def lacks(off_model: float) -> str:

@@ -30,7 +30,7 @@ from scipy.ndimage import uniform_filter1d
 
 from p2p_lib.core import se3
 from p2p_lib.core.config import Config, from_toml
-from p2p_lib.core.errors import MissingData
+from p2p_lib.core.errors import MissingData, listed
 from p2p_lib.core.files import load_arrays, replace_text, save_arrays, writing_alone
 from p2p_lib.core.mesh import save
 from p2p_lib.core.paths import seen_from
@@ -57,6 +57,10 @@ _GROSS = 2.0
 CAUSAL = "causal"
 #: Of a squared Mahalanobis distance with six degrees of freedom: three standard deviations (99.73 %).
 _CHI2_6 = 20.06
+#: Poses nearer to each other than this, m at the object's keypoints and degrees, are both good enough: it is not told.
+_NEAR_M, _NEAR_DEG = 0.003, 2.0
+#: Stretches of frames that are told.
+_TOLD = 5
 
 
 def refine_run(folder: str | Path, progress: bool = False, force: bool = False) -> list[str]:
@@ -208,6 +212,14 @@ def disagreement(causal: ObjectRun, T_cam_obj: np.ndarray) -> np.ndarray:
     return squared
 
 
+def far_apart(causal: ObjectRun, T_cam_obj: np.ndarray, p_obj: np.ndarray) -> np.ndarray:
+    """(n,) bool: poses (n, 4, 4) that move or turn keypoints p_obj (N, 3) far from where the causal ones do."""
+    deg, _ = se3.error_deg_mm(T_cam_obj, causal.T_cam_obj)
+    centre = np.median(p_obj, axis=0, keepdims=True) if len(p_obj) else np.zeros((1, 3))
+    moved_m = np.linalg.norm(se3.transform(T_cam_obj, centre) - se3.transform(causal.T_cam_obj, centre), axis=-1)
+    return (moved_m[:, 0] > _NEAR_M) | (deg > _NEAR_DEG)
+
+
 def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
     """Put the finished parts together in the place of an earlier offline result; a line on each object.
 
@@ -217,7 +229,7 @@ def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
     shutil.rmtree(new, ignore_errors=True)
     (new / "poses").mkdir(parents=True)
     arrays: dict[str, np.ndarray] = {}
-    summary, disagrees = [], {}
+    summary, disagrees, keypoints = [], {}, load_keypoints(made.run.path)
     for name, obj in made.run.objects.items():
         part = load_arrays(parts / f"{name}.npz")
         kept = part.pop(CAUSAL, np.zeros(len(obj), bool))  # an object that never had a pose has no part
@@ -226,9 +238,12 @@ def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
         has = offline.has_pose
         lines = map(tum_line, offline.time_s[has].tolist(), offline.T_cam_obj[has])
         replace_text(new / "poses" / f"{name}.txt", "".join([OFFLINE_COMMENT] * bool(has.any()) + list(lines)))
-        off = np.flatnonzero(disagreement(obj, offline.T_cam_obj) > _CHI2_6)
+        p_obj = keypoints[name].p_obj[keypoints[name].promoted] if name in keypoints else np.zeros((0, 3))
+        far = far_apart(obj, offline.T_cam_obj, p_obj)
+        off = np.flatnonzero(far & (disagreement(obj, offline.T_cam_obj) > _CHI2_6))
         disagrees[name] = [int(obj.frame_index[k]) for k in off]
         told = f", {int(kept.sum())} of them the causal one, {len(off)} more than three sigmas from it"
+        told += f" and {1000 * _NEAR_M:g} mm or {_NEAR_DEG:g} degrees" * bool(len(off))
         summary.append(f"{name}: {_in_words(obj, offline)}{told}{in_ranges(disagrees[name])}")
     save_arrays(new / "poses.npz", arrays)
     for file_name in ("config.toml", "models.npz", "masks.npz"):
@@ -258,7 +273,8 @@ def _in_words(causal: ObjectRun, offline: ObjectRun) -> str:
 
 
 def in_ranges(frames: list[int]) -> str:
-    """``: frames 3 to 9, 12`` of numbers in order; nothing of none."""
+    """``: frames 3 to 9, 12`` of numbers in order, of many stretches the longest first; nothing of none."""
     runs = np.split(np.array(frames, int), np.flatnonzero(np.diff(frames) > 1) + 1) if frames else []
-    text = ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
-    return f": frames {text}" if text else ""
+    runs = sorted(runs, key=len, reverse=True) if len(runs) > _TOLD else runs
+    texts = [f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
+    return f": frames {listed(texts, _TOLD)}" if texts else ""

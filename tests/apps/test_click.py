@@ -439,6 +439,22 @@ def test_the_server_says_what_mask_the_clicks_make(sequence, out):
         assert status == 400 and "expected pixels within" in found["error"] and not out.exists()
 
 
+def test_a_missing_depth_image_does_not_keep_the_page_closed(sequence, out, monkeypatch):
+    """`p2p run --skip-bad` goes on without it, and needs the prompts; the frame itself says why it cannot be shown."""
+    (sequence.path / "depth" / "1.png").unlink()
+    answers = []
+
+    def visit(page: Clicker, *_: object) -> tuple[Prompt, ...]:
+        answers.extend(get(f"{page.url}frame/{k}")[:2] for k in range(3))
+        answers.append(post(page.url, {"objects": [one(frame=1)]}))
+        return page.prompts
+
+    monkeypatch.setattr("p2p_lib.apps.click.wait_for_clicks", visit)
+    assert cli.main(["click", str(sequence.path), "--out", str(out)]) == 0
+    assert [status for status, _ in answers] == [200, 500, 200, 400]
+    assert "1.png" in json.loads(answers[1][1])["error"] and "1.png" in answers[3][1]["error"]
+
+
 def test_the_command_ends_when_it_is_finished(sequence, out):
     command = [sys.executable, "-m", "p2p_lib.apps.cli", "click", str(sequence.path), "--out", str(out), "--no-browser"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -12,7 +12,7 @@ from p2p_lib.core.config import preset
 from p2p_lib.core.errors import Doubt
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.runs import ObjectRun
-from p2p_lib.evaluation.evidence import surface_in_view
+from p2p_lib.evaluation.evidence import depth_as_taken, surface_in_view
 from p2p_lib.extended.default import compose
 from p2p_lib.extended.depth_lag import DEPTH_MOVED, DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
@@ -153,5 +153,6 @@ def test_a_run_is_judged_by_depth_as_it_took_it(tmp_path):
     trimesh.Trimesh(corners, faces, process=False).export(tmp_path / "cards.ply")
     seen = PoseEstimate("cards", 3, 0.1, Status.TRACKED, np.eye(4), 1.0)
     cards = ObjectRun.of("cards", [seen], SimpleNamespace(truth={}), [None])
-    late, moved = (surface_in_view(cards, Film(), tmp_path / "cards.ply", None, 1, said).on_surface[0] for said in SAID)
+    depths = (depth_as_taken(Film(), said, 1) for said in SAID)
+    late, moved = (surface_in_view(cards, Film(), tmp_path / "cards.ply", None, 1, of).on_surface[0] for of in depths)
     assert late < 0.75 and moved > 0.9

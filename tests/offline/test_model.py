@@ -16,6 +16,7 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.core.raycasting import SurfaceDistance
 from p2p_lib.core.types import evenly
 from p2p_lib.datasets.models import MESHES, find_models, load_mesh
+from p2p_lib.datasets.runs import load_run
 from p2p_lib.offline import holes, model, texture
 from p2p_lib.offline.finished import Finished, Renderer
 from p2p_lib.offline.products import write_product
@@ -348,6 +349,14 @@ def test_a_model_that_lacks_a_part_is_told(finished):
         render = Renderer(whole.vertices, whole.faces, made.sequence.camera)
         assert model.beside(wide, "box", np.arange(0, len(made.frames), 4), render) == 0
     assert model.lacks(shares[0]) == "" and "lacks a part" in model.lacks(shares[2])
+
+
+@pytest.mark.parametrize(("share", "says"), [(0.1, ""), (0.6, "6")])
+def test_a_model_of_doubted_poses_says_so_first(finished, share, says):
+    obj = load_run(finished).objects["box"]
+    obj = obj.select(obj.has_pose)
+    said = model.often_doubted(replace(obj, confidence=np.where(np.arange(len(obj)) < share * len(obj), 0.3, 0.9)))
+    assert bool(said) == bool(says) and said.startswith(says) and ("(median confidence 0.30)" in said) == bool(says)
 
 
 def test_a_surface_is_cleaned_of_what_no_object_has():

@@ -414,7 +414,8 @@ def test_covariances_are_new_and_where_both_disagree_is_told(refined):
     np.testing.assert_array_equal(refined.covariance[kept], causal.covariance[kept])
     wrong = json.loads((tracked / "offline/run.json").read_text())["disagrees_above_3_sigma"]
     assert {5, 6, 7} <= set(wrong["box"]) and len(wrong["box"]) < 10 and wrong["can"] == []
-    assert f"{len(wrong['box'])} more than three sigmas from it{offline.in_ranges(wrong['box'])}" in told[0]
+    off = f"{len(wrong['box'])} more than three sigmas from it and 3 mm or 2 degrees"
+    assert f"{off}{offline.in_ranges(wrong['box'])}" in told[0]
     assert told[1].endswith("0 more than three sigmas from it")
 
 
@@ -473,6 +474,18 @@ def test_disagreement_is_measured_by_the_causal_covariance(made):
     np.testing.assert_allclose(squared[obj.has_pose], 25, rtol=1e-6)  # 5 mm of 1 mm
     assert np.isnan(squared[~obj.has_pose]).all()
     assert offline.in_ranges([3, 4, 5, 9]) == ": frames 3 to 5, 9"
+    assert offline.in_ranges([0, 2, 4, 6, 8, 9, 11]) == ": frames 8 to 9, 0, 2, 4, 6 and 1 more"
+
+
+def test_poses_that_are_both_good_do_not_disagree(made):
+    """At the object's keypoints, wherever its frame has its origin; however small the covariance."""
+    obj, p_obj = made.run.objects["can"], np.array([[0.0, 0, 0.8]])
+    about = np.eye(4)
+    about[:3, 3] = p_obj[0]
+    for turn, step_m, far in ((0.03, 0.002, False), (0, 0.004, True), (0.04, 0, True)):
+        move = [0, turn, 0, step_m, 0, 0]
+        moved = obj.T_cam_obj @ about @ se3.exp(np.array(move)) @ se3.inverse(about)
+        assert (offline.far_apart(obj, moved, p_obj)[obj.has_pose] == far).all()
 
 
 def test_what_cannot_be_refined_is_a_sentence(tracked, capsys):
