@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, Protocol
 
 import numpy as np
@@ -197,10 +198,16 @@ def _named(format: str) -> Iterator[None]:
     except Exception as error:
         if format in FORMATS or isinstance(error, P2PError):
             raise
-        what, got = f"format {format}", f"{type(error).__name__} ({in_a_line(error)})"
+        what, got = f"format {format}", f"{type(error).__name__}: {in_a_line(error)}"
+        frames = [(str(f.f_globals.get("__name__")), f.f_code, line) for f, line in walk_tb(error.__traceback__)]
+        ran = [(module.partition(".")[0], code, line) for module, code, line in frames]
+        package = next((of for of, _, _ in ran if of not in ("p2p_lib", "contextlib")), None)
+        if theirs := [(code, line) for of, code, line in ran if of == package]:
+            got += f" in {theirs[0][0].co_qualname} ({theirs[-1][0].co_filename}:{theirs[-1][1]})"
         if isinstance(error, OSError):
-            raise MissingData(what, f"its loader could not read a file: {got}") from error
-        raise BadInput(what, got, "a loader that ends without an error", "--debug shows where it was.") from error
+            raise MissingData(what, f"its loader could not read a file, {got}") from error
+        fix = "--debug shows the traceback."
+        raise BadInput(what, got, "a loader that ends without an error", fix) from error
 
 
 def _truth(sequence: Sequence, read: Callable[[], Any]) -> dict[str, ObjectTruth]:

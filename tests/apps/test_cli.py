@@ -91,7 +91,7 @@ def test_eval_prints_exactly_one_json_object(done, capsys):
     out, err = capsys.readouterr()
     got = json.loads(out)  # anything beside one object would be "Extra data"
     assert err == "" and "NaN" not in out and "Infinity" not in out
-    ran = {"tracker", "masks", "segmenter", "preset", "seed", "align"}
+    ran = {"tracker", "masks", "segmenter", "preset", "changed", "seed", "align"}
     assert set(got) == {"objects", "mean", "hz", "p95_ms"} | ran
     assert set(got["objects"]) == {"object"}
     assert set(got["objects"]["object"]) == SCORES | {"frames", "lost", "frames_to_recovery"}

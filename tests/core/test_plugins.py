@@ -248,7 +248,12 @@ def test_a_module_that_does_not_load_says_what_of_it(theirs, line, error, said):
         ("tracker", "Unlucky", r"Unlucky.track raised ValueError: no luck today \(\S+their_parts.py:(\d+)\)"),
         ("detector", "Blind", r"Blind.detect raised FileNotFoundError: .*weights' \(\S+their_parts.py:(\d+)\)"),
         ("masks", "Torn", r"Torn.segment raised KeyError: 'labels' \(\S+their_parts.py:(\d+)\)"),
-        ("format", "unread", r"unread raised ValueError: no luck today \(\S+their_parts.py:(\d+)\)"),
+        (
+            "format",
+            "unread",
+            r"got ValueError: no luck today in unread \(\S+their_parts.py:(\d+)\), "
+            "expected a loader that ends without an error",
+        ),
     ],
 )
 def test_what_a_part_raises_is_said_with_its_place(theirs, sequence, tmp_path, capsys, option, part, said):
