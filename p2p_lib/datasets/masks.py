@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.errors import BadInput, MissingData, did_you_mean
 from p2p_lib.core.options import MASK_SOURCES
 from p2p_lib.datasets.images import LOSSLESS, check_paired, check_size, list_files, read_image
 
@@ -62,6 +62,7 @@ def find_masks(
     """
     if not folder.is_dir():
         fix = f"Name a folder inside the sequence, a path, or {', '.join(MASK_SOURCES)}."
+        fix = f"{did_you_mean(folder.name, MASK_SOURCES)} {fix}".strip()
         raise MissingData(str(folder), "no such folder of masks", fix)
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
     names = objects or below
