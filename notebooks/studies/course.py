@@ -85,7 +85,7 @@ LESSONS = (
     Lesson(
         "07_occlusion_recovery",
         "Occlusion and recovery",
-        'section "Results on YCBMultiTrack" and the ablation P2P-SH(10)',
+        'section "Results on YCBMultiTrack" and the ablation P2P-SH(10); the second half is ours',
         "a box behind a hand: the return frame by frame, long range against SH(10), confidence; never lost for good",
     ),
     Lesson(
@@ -109,7 +109,7 @@ LESSONS = (
     Lesson(
         "11_label_your_own",
         "Label your own",
-        'section "3D Reconstruction", and what follows from it',
+        'the fused surface alone, section "3D Reconstruction"; offline pass, textured models and labels are ours',
         "from a video and three clicks to a textured model and labelled images, and how to tell that a label is good",
     ),
 )

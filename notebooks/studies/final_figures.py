@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from pandas import read_csv, to_numeric
+from pandas import Series, read_csv, to_numeric
 
 from p2p_lib.benchmark.benchmark import Benchmark, load_benchmark
 from p2p_lib.benchmark.execution import measured, perform
@@ -133,13 +133,16 @@ def error_histograms(benchmark: Benchmark) -> Figure:
         errors: dict[str, list] = defaultdict(list)
         for job, outcome in benchmark.results:
             errors[job.method.name] += [1e3 * obj.errors_m("first")[key] for obj in outcome.objects.values()]
-        for colour, name in zip(style.METHODS, filter(errors.get, benchmark.methods), strict=False):
+        names = list(filter(errors.get, benchmark.methods))
+        for k, (colour, name) in enumerate(zip(style.METHODS, names, strict=False)):
             errors_mm = np.concatenate(errors[name])
             weights = np.full(len(errors_mm), 100 / len(errors_mm))
             percent, _ = np.histogram(np.maximum(errors_mm, EDGES_MM[0]), EDGES_MM, weights=weights)
-            axis.stairs(percent, EDGES_MM, color=colour, label=f"{name} ({len(errors_mm)} frames)")
+            wide = len(names) - 1 - k  # what coincides with a later line shows on both sides of it
+            look = {"color": colour, "linewidth": 1.2 + 1.2 * wide}
+            axis.stairs(percent, EDGES_MM, label=f"{name} ({len(errors_mm)} frames)", **look)
             beyond = weights[errors_mm >= EDGES_MM[-1]].sum()
-            axis.plot(1.4 * EDGES_MM[-1], beyond, "x", color=colour, clip_on=False, markersize=5)
+            axis.plot(1.4 * EDGES_MM[-1], beyond, "x", color=colour, clip_on=False, markersize=5 + 3 * wide)
         axis.axvline(EDGES_MM[-1], color=style.NEUTRAL[1], linewidth=0.8)
         logarithmic(axis.xaxis)
         axis.set(xlabel=f"{title} [mm]", xlim=(EDGES_MM[0], 2 * EDGES_MM[-1]), ylim=(0, None))
@@ -153,16 +156,20 @@ def error_histograms(benchmark: Benchmark) -> Figure:
 def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure:
     """True boxes (white, dashed), estimated ones, and the 2D tracks of the keypoints coloured by their error.
 
+    From the frame with the smallest ADD, of the worse object, to that with the largest.
     The error is the distance in pixels from where the tracker saw a keypoint to the keypoint of the final map projected
     with the true pose; points that the map has dropped since are not drawn.
     """
     scene, images = scene_of(benchmark, method), []
     run, scores, keypoints = scene.run, evaluate(scene.run).objects, load_keypoints(scene.run.path)
     seen = np.flatnonzero(np.logical_and.reduce([obj.has_pose & obj.has_truth for obj in run.objects.values()]))
-    seen = seen[seen > 0]  # the first has no tracks yet
+    off_m = [Series(s.add_m, s.frame_index).reindex(run.objects[name].frame_index) for name, s in scores.items()]
+    worst_m = np.max([off.to_numpy() for off in off_m], 0)
+    seen = seen[(seen > 0) & np.isfinite(worst_m[seen])]  # the first has no tracks yet
     if not len(seen):
         raise MissingData(str(run.path), "no frame in which every object has a pose")
-    for row in seen[np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist():
+    rows = seen[np.argsort(worst_m[seen])][np.linspace(0, len(seen) - 1, count).round().astype(int)].tolist()
+    for row in rows:
         tracks = []
         for name, score in scores.items():
             obj = run.objects[name]
@@ -172,9 +179,10 @@ def tracks_by_error(benchmark: Benchmark, method: str, count: int = 3) -> Figure
         dots = uv_px, overlay.value_colours(error_px, 0, FAR_PX)
         images.append(scene.draw(row, scene.region(), 420, axes=False, trail=0, dots=dots))
     high_in = WIDTH_IN / count * images[0].shape[0] / images[0].shape[1]
-    figure, axes = panels(count, (WIDTH_IN, high_in + 0.6), side_by_side=True)
-    for axis, image in zip(axes, images, strict=True):
+    figure, axes = panels(count, (WIDTH_IN, high_in + 0.9), side_by_side=True)
+    for axis, image, row in zip(axes, images, rows, strict=True):
         axis.imshow(image)
+        axis.set_title(f"ADD {1e3 * worst_m[row]:.3g} mm", fontsize=9)
         axis.set_axis_off()
     colours = ScalarMappable(Normalize(0, FAR_PX), "cividis")
     bar = figure.colorbar(colours, ax=axes, location="bottom", aspect=60, pad=0.02, extend="max")

@@ -23,6 +23,7 @@ from p2p_lib.core.raycasting import ray_scene
 from p2p_lib.core.types import Frame, Status
 from p2p_lib.datasets.alignment import background_share, rim
 from p2p_lib.datasets.models import MESHES, find_models
+from p2p_lib.datasets.prompts import prompts_in
 from p2p_lib.datasets.runs import Run
 from p2p_lib.datasets.sequence import Sequence as Recording
 from p2p_lib.evaluation.evidence import drawn_m, on_surface
@@ -83,6 +84,18 @@ longest stretch. Good again: frames in view after it until the pose is within 2 
 more than 1 cm off the true surface at the end. The line in the bar is the goal: lies in 0.5 % of the frames and for 5
 in a row, good again after 15 frames, 5 % of the mesh. What misses it is bold."""
     return save_figure(fault_picture(read_csv(file)), "own_faults", caption, sources=[file], parameters=parameters)
+
+
+def spread_clicks(masks: Mapping[str, np.ndarray], frame: int = 0) -> tuple[Prompt, ...]:
+    """Three clicks in each mask (H, W) that is not empty: where it is deepest, and towards both its ends."""
+    prompts = []
+    for middle in prompts_in(masks, frame):
+        depth = cv2.distanceTransform(masks[middle.name].astype(np.uint8), cv2.DIST_L2, 5)
+        inside = np.argwhere(depth > 0.5 * depth.max())[:, ::-1].astype(float)
+        along = (inside - inside.mean(0)) @ np.linalg.svd(inside - inside.mean(0), full_matrices=False)[2][0]
+        ends = inside[[along.argmin(), along.argmax()]]
+        prompts.append(Prompt(middle.name, frame, np.concatenate([middle.points_px, ends])))
+    return tuple(prompts)
 
 
 def errors_against(source: Recording, frames: Iterable[int], run: Run) -> dict[str, tuple[np.ndarray, np.ndarray]]:

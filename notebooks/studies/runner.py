@@ -114,6 +114,9 @@ def run_notebooks(
     if jobs < 1:
         raise BadInput("jobs", jobs, "at least 1")
     paths = list_notebooks(folder, only)
+    if "PROFILE" in (parameters or {}):
+        fix = "The profile is chosen by --profile, in Python by profile=."
+        raise BadInput("parameter", "PROFILE", "one of a notebook's others", fix)
     given = {**(parameters or {}), "PROFILE": profile}
     plans = [(path, _fitting_parameters(path, given)) for path in paths]
     own = [re.sub(r"[^\w.]+", "-", f"{name}={value}") for name, value in (parameters or {}).items()]
@@ -305,7 +308,8 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
     for name, value in given.items():
         if name not in known:
             fix = did_you_mean(name, known) or "Pick the notebooks that have it with --only."
-            raise BadInput(f"{path.stem} parameter", name, "one of " + ", ".join(known), fix)
+            others = ", ".join(own for own in known if own != "PROFILE")
+            raise BadInput(f"{path.stem} parameter", name, f"one of {others}" if others else "none: it has none", fix)
         kind = type(known[name])
         try:
             values[name] = TypeAdapter(kind).validate_python(value, strict=not isinstance(value, str))

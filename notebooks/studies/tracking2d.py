@@ -193,7 +193,8 @@ def found_over_time(scores: Mapping[str, TrackerScore | str], times_s: np.ndarra
         came = score_outcomes(score)
         in_sight = ((came != QueryOutcome.NOT_ASKED) & score.truth.visible).sum(1)
         share = np.where(in_sight > 0, (came == QueryOutcome.RIGHT).sum(1) / np.maximum(in_sight, 1), np.nan)
-        axis.plot(times_s, 100 * share, color=colour, label=label)
+        known = {"color": style.NEUTRAL[0], "ls": "--"} if label == "oracle" else {"color": colour}
+        axis.plot(times_s, 100 * share, label=label, **known)
     below.fill_between(times_s, in_sight, color=style.NEUTRAL[1], lw=0)
     axis.set(ylabel=f"within {FOUND_PX:.0f} px [%]", ylim=(0, 103))
     axis.set_title(f"Points in sight that are found, {next(iter(ran.values())).info['sequence']}")
@@ -245,7 +246,9 @@ def reliability_plot(rows: Mapping[str, Reliability], uncertain_px: Mapping[str,
             axis.plot(row.uncertainty, stated_px, "--", color=style.NEUTRAL[0], label="standard deviation stated")
         axis.set(xlabel=r"uncertainty $\sigma_t$", title=f"{label}: rank correlation {row.rank_correlation:.2f}")
         logarithmic(axis.yaxis)
-        axis.sharey(axes[0])
+    low, high = zip(*(axis.get_ylim() for axis in axes))
+    for axis in axes:
+        axis.set_ylim(min(low), max(high))
     axes[0].set_ylabel("error [px]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower right", ncols=3, fontsize=8)
     return figure

@@ -124,7 +124,8 @@ def check_folder(
         drawn = drawing.FirstMasks(picture, prompts)
         for first in {frame.index: frame for frame, _ in firsts.values()}.values():
             drawn.add(first, {name: mask for name, (frame, mask) in firsts.items() if frame.index == first.index})
-    sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects)
+    unprompted = "" if prompts else "Objects are called as the masks are, or as prompts call them: --prompts FILE."
+    sizes_m = lengths_m(sizes, dict.fromkeys(prompt.name for prompt in prompts) or sequence.objects, unprompted)
     size = f"{sequence.format}: {len(sequence)} images of {sequence.camera.width}x{sequence.camera.height}"
     scale = getattr(sequence, "depth_scale", 1.0)
     findings = [*wrong, Finding("files", Level.OK, f"{size}, {len(frames)} looked at"), _camera(sequence.camera)]

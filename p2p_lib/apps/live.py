@@ -174,8 +174,8 @@ class _Tracked:
             yield method.step(frame)
             if frame is not first:  # which may be long ago
                 count.count(frame)
-                if count.frames == 2 and count.dropped:  # the first frame took as long as first masks do
-                    self.live.say(f"{count.dropped} images came while the first masks were made, and were dropped")
+                if count.frames == 2 and count.dropped:  # it took as long as first masks or a search do
+                    self.live.say(f"{count.dropped} images came while the first frame was worked on, and were dropped")
             count.seconds = monotonic() - start_s
             frame = newest.take()
         if newest.stopped and self.options.stop is not None:

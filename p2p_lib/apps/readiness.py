@@ -9,6 +9,7 @@ from textwrap import shorten
 from p2p_lib.benchmark.benchmark import Benchmark
 from p2p_lib.benchmark.jobs import Job, jobs_of
 from p2p_lib.benchmark.plan import plan_names, read_plan
+from p2p_lib.core.paths import data_dir
 from p2p_lib.datasets import manifests
 from p2p_lib.datasets.sequence import SYNTHETIC
 
@@ -66,10 +67,11 @@ def what_to_fetch(benchmark: Benchmark) -> list[str]:
     for job, outcome in benchmark.results:
         dataset = job.sequence.name.partition("/")[0]
         models = {**job.sequence.synthetic, **job.method.synthetic}.get("models")
-        if outcome.status == "not run" and (_on_data(job) or models):
-            missing[str(models) if models else dataset].append(job.sequence.name)
+        wanted = str(models) if models else dataset
+        if outcome.status == "not run" and not _there(job.sequence.name, wanted):
+            missing[wanted].append(job.sequence.name)
     lines = []
-    for dataset in (name for name in missing if name in manifests.names("dataset")):
+    for dataset in missing:
         of, sequences = manifests.manifest(dataset), dict.fromkeys(missing[dataset])
         frames = {f"{dataset}/{entry.name}": entry.frames for entry in of.sequences}
         named = [name + (f" ({frames[name]} frames)" if frames.get(name) else "") for name in sequences]
@@ -77,6 +79,15 @@ def what_to_fetch(benchmark: Benchmark) -> list[str]:
         how = f"p2p data fetch {dataset}" if of.access == "open" else f"by hand, see p2p data info {dataset}"
         lines.append(f"Missing: {', '.join(named)}. {of.title}, {size}: {how}")
     return lines
+
+
+def _there(sequence: str, dataset: str) -> bool:
+    """Whether nothing of a dataset has to be fetched for a sequence: models of a rendered one, or its own files."""
+    if dataset not in manifests.names("dataset"):
+        return True
+    if not sequence.startswith(SYNTHETIC):
+        return manifests.find_sequence(sequence) is not None
+    return data_dir() is not None and manifests.folder_of(manifests.manifest(dataset)).is_dir()
 
 
 def _on_data(job: Job) -> bool:

@@ -65,6 +65,10 @@ def _export(a: argparse.Namespace) -> None:
     written = [marked(path) for path in written] if run.info.get("offline") else written
     files = (f"{path}/*.txt ({len(list(path.iterdir()))})" if path.is_dir() else str(path) for path in written)
     print(f"Written: {', '.join(files)}")
+    poses = [(obj.has_pose.sum(), obj.of_confidence(least).has_pose.sum()) for obj in run.objects.values()]
+    had, kept = map(sum, zip(*poses))
+    if kept < had:
+        warn(f"p2p export: {had - kept} of {had} poses left out, of a confidence below {least:g}.")
 
 
 @command(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -209,6 +210,8 @@ def _benchmark(a: argparse.Namespace) -> int:
             print(words, flush=True)
         return 0
     if a.stale:
+        if a.quick:
+            raise BadInput("benchmark", "--stale with --quick", "one of them", "What is stale is made anew in full.")
         return _stale(a)
     if a.present and not (present := present_plans()):
         warn("p2p benchmark: no dataset of a plan is below $P2P_DATA (see p2p data list), so there is nothing to run")
@@ -232,7 +235,8 @@ def _benchmark(a: argparse.Namespace) -> int:
             made["commit"] = next((str(outcome.ran.get("commit")) for _, outcome in done), None)
             save_table(paper_table(benchmark), benchmark.plan.name, sources=[benchmark], parameters=made, to=a.tables)
     if any(benchmark.interrupted for benchmark in benchmarks):
-        raise KeyboardInterrupt
+        again = shlex.join([*map(str, a.plan), "--out", str(a.out), *["--quick"] * a.quick])
+        raise KeyboardInterrupt(f"Go on with it: p2p benchmark {again}")
     ended = [benchmark.counts() for benchmark in benchmarks]
     if failed := sum(count["failed"] for count in ended):
         warn(f"p2p benchmark: {failed} runs failed; the tables say why. --retry tries them again.")

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Generator, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 
 from p2p_lib.benchmark import rows
 from p2p_lib.benchmark.execution import execute
@@ -164,10 +165,11 @@ def run_benchmarks(
 
 def load_benchmark(plan: str | Path | Plan, out: str | Path, profile: str = "full") -> Benchmark:
     """What is on disk of a plan; nothing is run. What is not there is ``not run``, with what would run it."""
+    named = plan.name if isinstance(plan, Plan) else quote(str(plan))
     plan, out = plan if isinstance(plan, Plan) else read_plan(plan), Path(out).absolute()
     results = []
     for job in jobs_of(plan, profile):
-        reason = job.reason or f"not run yet: p2p benchmark {plan.name}"
+        reason = job.reason or f"not run yet: p2p benchmark {named}"
         known = load_outcome(out, job.key) if job.key else None
         results.append((job, known or Outcome(key=job.key, status="not run", reason=reason)))
     return Benchmark(plan, profile, out, tuple(results))

@@ -60,7 +60,12 @@ def perform(work: Work, job: Any, out: Path, library: str) -> Outcome:
     except Exception as error:  # noqa: BLE001 one failing run must not end the others
         replace_text(out / "failures" / f"{job.key}.txt", traceback.format_exc())
         kind = "" if isinstance(error, P2PError) else f"{type(error).__name__}: "
-        return Outcome(key=job.key, status="failed", reason=f"{kind}{' '.join(str(error).split())}"[:500])
+        return Outcome(key=job.key, status="failed", reason=_cut(f"{kind}{' '.join(str(error).split())}"))
+
+
+def _cut(text: str) -> str:
+    """At most 500 letters, of long lists in the middle fewer: what to do stands last."""
+    return text if len(text) <= 500 else f"{text[:298]} ... {text[-197:]}"
 
 
 def _show_others(shown: Callable, message: Any, category: type, *where: Any) -> None:

@@ -1,27 +1,32 @@
 """The runs that a plan asks for, each known by a key: a hash of all that decides its result.
 
 That is every parameter with the seed, tracker, detector and source of masks, the sequence, and the library's own
-source. Equal keys are one run, whichever plans ask for it. What is on disk under a key is never computed again.
+source with that of the modules of others that are named (not of what these import). Equal keys are one run, whichever
+plans ask for it. What is on disk under a key is never computed again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
+from inspect import signature
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
 from p2p_lib.benchmark.plan import Method, Plan, PlannedSequence, prompts_file, prompts_places, uses_clicks
+from p2p_lib.core import plugins
+from p2p_lib.core.backends import ALIASES, DETECTORS, SEGMENTERS, TRACKERS
 from p2p_lib.core.config import Config, preset
-from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError, did_you_mean
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData, P2PError, did_you_mean, listed
 from p2p_lib.core.files import read_toml
-from p2p_lib.core.options import RunOptions
+from p2p_lib.core.options import MASK_SOURCES, RunOptions
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.prompts import Prompt
 from p2p_lib.datasets import checkpoints, manifests
@@ -31,8 +36,10 @@ from p2p_lib.datasets.provenance import code_digest
 from p2p_lib.datasets.resized import Resized, resized_prompt
 from p2p_lib.datasets.schema import first_fault
 from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, open_sequence
+from p2p_lib.evaluation.oracle import OracleTracker
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
 from p2p_lib.synthetic.faults import Faulty
+from p2p_lib.synthetic.scenarios import SCENARIOS
 
 #: Beside the sequences of ``DATASET/*``, written by whoever knows: ``[SEQUENCE]``, then a line ``OBJECT = "COLUMN"``
 #: each, with the column of the paper's table that it fills ("one object 1 sugar"). Others have columns of their own.
@@ -95,9 +102,9 @@ def jobs_of(plan: Plan, profile: str) -> list[Job]:
     scope = plan.scope(profile)
     measures: list[Literal["poses", "tracks"]] = ["poses", "tracks"] if plan.tracks and scope.tracks else ["poses"]
     methods = plan.methods(profile)
-    lacking = {method.name: _lacking(method) for method in methods}
+    lacking = {method.name: _unknown(plan, method) or _lacking(method) for method in methods}
     configs = {method.name: _config(plan, method) for method in methods}
-    known: dict[tuple, str] = {}  # of this call alone: files may change until the next
+    known: dict[tuple, tuple[str, Sequence]] = {}  # of this call alone: files may change until the next
     jobs = []
     for planned in scope.planned:
         for sequence, missing in _present(planned):
@@ -145,7 +152,26 @@ def _config(plan: Plan, method: Method) -> Config:
         raise BadInput(name, error.got, error.expected, error.fix) from None
 
 
-def _keyed(job: Job, config: Config, known: dict[tuple, str]) -> Job:
+def _unknown(plan: Plan, method: Method) -> str:
+    """Why a part of somebody else's cannot be loaded; "" where all can. :class:`BadInput` where a name is none."""
+    parts = [
+        ("tracker", method.tracker, TRACKERS | {OracleTracker.name: ""}),
+        ("detector", method.detector, DETECTORS),
+        ("segmenter", RunOptions(masks=method.masks).mask_source().segmenter, SEGMENTERS),
+    ]
+    try:
+        for kind, name, ours in parts:
+            if ALIASES.get(name, name) not in ours:
+                plugins.find(kind, name, ours)
+    except MissingBackend as error:
+        return str(error)
+    except BadInput as error:
+        name = f"plan {plan.name}, method {method.name!r}: {error.name}"
+        raise BadInput(name, error.got, error.expected, error.fix) from None
+    return ""
+
+
+def _keyed(job: Job, config: Config, known: dict[tuple, tuple[str, Sequence]]) -> Job:
     """The job with its key, or with the reason why it cannot run."""
     method, planned = job.method, job.sequence
     try:
@@ -161,7 +187,7 @@ def _keyed(job: Job, config: Config, known: dict[tuple, str]) -> Job:
             "prompts": [[p.as_dict(), "" if p.mask is None else _sha(p.mask.tobytes())] for p in job.prompts],
             "chamfer": job.chamfer,
             "min_visible_px": job.min_visible_px,
-        }
+        } | _others(method, planned)
     except P2PError as error:
         if isinstance(error, BadInput) and planned.name.startswith(SYNTHETIC):
             raise  # the plan's mistake; of files, it is theirs
@@ -238,21 +264,66 @@ def _synthetic(planned: PlannedSequence, method: Method) -> tuple[dict[str, Any]
     return given | {"models": str(folder)}, given | {"models": _sha(_listing(folder))}
 
 
-def _fingerprint(job: Job, known: dict[tuple, str]) -> Any:
+def _fingerprint(job: Job, known: dict[tuple, tuple[str, Sequence]]) -> Any:
     """What stands for the sequence: a generator's parameters, else names and sizes of all files, truth and models."""
     planned, method = job.sequence, job.method
     if planned.name.startswith(SYNTHETIC):
         from p2p_lib.synthetic.generate import generator_version
 
+        _check_scene(job)
         return [planned.name, job.sequence_seed, generator_version(), _synthetic(planned, method)[1]]
-    key = (planned.name, planned.format, method.masks, tuple(planned.models.items()))
+    key = (planned.name, planned.format, planned.start, method.masks, job.measure, tuple(planned.models.items()))
     if key not in known:
         known[key] = _files_hash(job)
-    return known[key]
+    _check_objects(job, known[key][1].objects)
+    return known[key][0]
 
 
-def _files_hash(job: Job) -> str:
-    """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else."""
+def _others(method: Method, planned: PlannedSequence) -> dict[str, Any]:
+    """Hashes of the modules in which named parts of others are, which have been loaded; nothing where all are ours."""
+    named = {"tracker": method.tracker, "detector": method.detector, "dataset": planned.format}
+    named["segmenter"] = RunOptions(masks=method.masks).mask_source().segmenter
+    offered = {kind: plugins.offered(kind).get(name) for kind, name in named.items()}
+    places = [point.value if (point := offered[kind]) else name for kind, name in named.items()]
+    modules = [sys.modules.get(place.partition(":")[0]) for place in places if plugins.is_place(place)]
+    files = [module.__file__ for module in modules if module is not None and module.__file__]
+    return {"others": [_sha(Path(file).read_bytes()) for file in files]} if files else {}
+
+
+def _check_objects(job: Job, known: Iterable[str]) -> None:
+    """That the sequence has the objects that the plan names."""
+    for name in job.sequence.objects:
+        if name not in known:
+            what, expected = f"plan: objects of {job.sequence.name}", f"some of {', '.join(known)}"
+            raise BadInput(what, repr(name), expected, did_you_mean(name, known))
+
+
+def _check_scene(job: Job) -> None:
+    """What can be told of a synthetic sequence before it is rendered."""
+    planned, folder = job.sequence, RunOptions(masks=job.method.masks).mask_source().folder
+    if (name := planned.name.removeprefix(SYNTHETIC)) not in SCENARIOS:
+        near = did_you_mean(name, SCENARIOS, SYNTHETIC) or "See p2p data list."
+        raise BadInput("plan: synthetic sequence", repr(planned.name), f"a bundled one, {SYNTHETIC}NAME", near)
+    if folder and not (Path(folder).expanduser().is_dir() or Path(folder).parts[0] == "masks"):
+        expected = f"a folder, or one of {', '.join(dict.fromkeys(MASK_SOURCES))}"
+        raise BadInput(f"plan: masks of {planned.name}", repr(folder), expected, did_you_mean(folder, MASK_SOURCES))
+    if planned.objects:
+        given, own = _synthetic(planned, job.method)[0], signature(SCENARIOS[name]).parameters
+        taken = {key: value for key, value in given.items() if key in own}
+        _check_objects(job, _labelled(name, job.sequence_seed, tuple(sorted(taken.items()))))
+
+
+@cache
+def _labelled(scenario: str, seed: int, parameters: tuple[tuple[str, Any], ...]) -> tuple[str, ...]:
+    """The objects of a scenario."""
+    return tuple(body.name for body in SCENARIOS[scenario](seed, **dict(parameters)).bodies if body.labelled)
+
+
+def _files_hash(job: Job) -> tuple[str, Sequence]:
+    """Content of the truth, of the models, of the first image and its masks; names and sizes of everything else.
+
+    With the sequence itself.
+    """
     job = replace(job, sequence=job.sequence.model_copy(update={"fault": None}))
     sequence, start = open_planned(job), job.sequence.start
     _check_start(job, sequence)
@@ -262,15 +333,22 @@ def _files_hash(job: Job) -> str:
     for name, truth in sorted(sequence.truth.items()):
         parts.append((name, truth.T_cam_model.tobytes() + truth.labelled.tobytes()))
     models = sorted((find_models(sequence) | job.models).items())
+    if job.measure == "poses" and not models:
+        places = listed([place for name in sequence.truth for place in sequence.model_places.get(name, ())], 3)
+        what = "none at " + places if places else "the layout has no place for any"
+        fix = 'Put one there, or name it in the plan: models = { OBJECT = "PATH" }.'
+        raise MissingData(f"{job.sequence.name}: models of {', '.join(sequence.truth)}", what, fix)
     parts += [(name, path.read_bytes() if path.is_file() else b"") for name, path in models]
     parts += [] if sequence.path is None else [("files", _listing(sequence.path))]
     parts += [("format", job.sequence.format.encode())] if job.sequence.format else []
-    return _sha(b"".join(name.encode() + content for name, content in parts))
+    return _sha(b"".join(name.encode() + content for name, content in parts)), sequence
 
 
 def _check_start(job: Job, sequence: Sequence) -> None:
     """That the sequence has what the method starts from; :class:`MissingData` says what to put where."""
     name, by = job.sequence.name, RunOptions(masks=job.method.masks).mask_source().name
+    if job.sequence.start >= len(sequence):
+        raise BadInput(f"plan: frames of {name}", f"start = {job.sequence.start}", f"one of its {len(sequence)} frames")
     if not sequence.truth:
         raise MissingData(f"{name}: truth", "there is none, so nothing could be scored", "Track it with p2p run.")
     if prompts := job.prompts:

@@ -118,7 +118,9 @@ class PlannedSequence(Strict):
     fault_frames: list[Count] = Field(default=[30, 60], min_length=2, max_length=2)
 
     @model_validator(mode="after")
-    def _is_of_files(self) -> PlannedSequence:
+    def _fits(self) -> PlannedSequence:
+        if self.stop is not None and self.stop <= self.start:
+            raise ValueError(f"{self.name}: start = {self.start}, stop = {self.stop}: that is no frame")
         if self.format and self.name.startswith(SYNTHETIC):
             raise ValueError(f"format = {self.format!r}: {self.name} is rendered and has its own")
         return self
@@ -188,13 +190,19 @@ class Plan(Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> Plan:
-        names = [method.name for method in self.method]
+        names, scopes = [method.name for method in self.method], [of for of in (self.quick, self.full) if of]
         if len(set(names)) < len(names):
             raise ValueError("two methods have one name")
-        if unknown := {*(self.quick.methods if self.quick else ()), *self.full.methods} - set(names):
-            raise ValueError(f"methods: no method is called {unknown.pop()!r}")
-        if unknown := {method.against for method in self.method} - {*names, ""}:
-            raise ValueError(f"against: no method is called {unknown.pop()!r}")
+        sequences = {sequence.name for of in scopes for sequence in of.sequence}
+        for key, what, given, known in (
+            ("methods", "method", {name for of in scopes for name in of.methods}, set(names)),
+            ("against", "method", {method.against for method in self.method}, {*names, ""}),
+            ("only", "sequence", {name for method in self.method for name in method.only}, sequences),
+            ("but", "sequence", {name for method in self.method for name in method.but}, sequences),
+        ):
+            for name in sorted(given - known):
+                near = did_you_mean(name, known) or f"There are {', '.join(sorted(filter(None, known)))}."
+                raise ValueError(f"{key}: no {what} is called {name!r} ({near})")
         return self
 
     @property

@@ -17,6 +17,7 @@ from p2p_lib.benchmark.outcome import ObjectOutcome, Outcome
 from p2p_lib.benchmark.plan import Plan
 from p2p_lib.evaluation import metrics
 from p2p_lib.evaluation.alignment import ALIGNMENTS
+from p2p_lib.evaluation.protocol import ran_with
 from p2p_lib.evaluation.recovery import recovered_within
 
 #: The errors of a frame, by what their area under the curve is called.
@@ -30,19 +31,21 @@ MEAN, POOLED = "mean over sequences", "pooled over frames"
 #: What MEAN is called where all of it is of one sequence (:func:`p2p_lib.benchmark.scoring.run_rows`).
 MEAN_OF_ONE = "mean over objects"
 
-#: The columns, in order. ``column`` is the paper's; ``key`` names the run's record; ``reason`` why there is no value.
+#: The columns, in order. ``column`` is the paper's, ``changed`` what is not as in the preset; ``key`` names the run's
+#: record; ``reason`` why there is no value.
 COLUMNS = (
     "plan profile method sequence object column seed metric form failures align value unit frames lost sequences "
-    "objects tracker detector masks preset commit modified library key reason"
+    "objects tracker detector masks preset changed commit modified library key reason"
 ).split()
 TIME_COLUMNS = (
-    "plan profile method sequence seed metric value unit objects width_px tracker preset commit modified library key"
+    "plan profile method sequence seed metric value unit objects width_px tracker preset changed commit modified "
+    "library key"
 ).split()
 #: What the rows of one number over seeds have in common.
 _SAME = [c for c in COLUMNS if c not in ("seed", "value", "frames", "lost", "key", "commit", "modified")]
 SUMMARY_COLUMNS = (
     "plan profile method sequence object column metric form failures align seeds value low high std unit sequences "
-    "objects tracker detector masks preset commit modified library reason"
+    "objects tracker detector masks preset changed commit modified library reason"
 ).split()
 
 Row = dict[str, Any]
@@ -211,6 +214,7 @@ def _head(plan: Plan, profile: str, job: Job, outcome: Outcome) -> Row:
     """What ran, as the run itself says, else as it was planned."""
     head = {"plan": plan.name, "profile": profile, "method": job.method.name, "sequence": shown_name(job)}
     asked = {key: getattr(job.method, key) for key in ("tracker", "detector", "masks", "preset")}
+    asked["changed"] = ran_with({"options": job.method.model_dump(include={"settings"})}).get("changed", "")
     known = {"commit": "", "modified": "", "library": ""} | asked | outcome.ran
     shown = (*asked, "commit", "modified", "library")
     return head | {"seed": job.seed, "key": job.key} | {k: "" if known[k] is None else known[k] for k in shown}

@@ -21,7 +21,7 @@ from p2p_lib.datasets.runs import Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen
 from p2p_lib.evaluation import reconstruction
 from p2p_lib.evaluation.faults import fault_score, mesh_off_share
-from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ObjectScore, evaluate
+from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ObjectScore, evaluate, ran_with
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,7 +53,7 @@ def scored(
             returns=[event.frames_to_recovery for event in score.returns],
             **(judge(name, score) if judge else {}),
         )
-    ran = {key: done.info.get(key) for key in RAN}
+    ran = {key: done.info.get(key) for key in RAN} | {"changed": ran_with(done.info).get("changed", "")}
     return Outcome(key=key, status="done", ran=ran, objects=objects, left_out=first.left_out)
 
 

@@ -52,7 +52,8 @@ class _Checked:
             if "choices" in meta and value not in meta["choices"]:
                 raise BadInput(name, repr(value), "one of " + ", ".join(meta["choices"]))
             if "form" in meta and not re.fullmatch(meta["form"], value.strip()):
-                raise BadInput(name, repr(value), meta["meaning"])
+                expected = meta["meaning"].rpartition(": ")[2].rstrip(".")
+                raise BadInput(name, repr(value), expected, "Names are parted by commas.")
             if kind in (int, float) and not meta.get("low", float("-inf")) <= value <= meta.get("high", float("inf")):
                 bounds = f"{meta.get('low', '-inf')} to {meta.get('high', 'inf')} {meta['unit']}".strip()
                 raise BadInput(name, value, f"a value in {bounds}: {meta['meaning']}")
@@ -264,7 +265,9 @@ class SelectionConfig(_Checked):
         " best supported one is selected unless the surface prefers another significantly.",
         choices=("surface", "support"),
     )
-    surface_sigmas: float = _p(5.0, "The surface must prefer another one by so many standard errors.", low=0)
+    surface_sigmas: float = _p(
+        5.0, "The surface must prefer another one, that no keypoints agree with, by so many standard errors.", low=0
+    )
 
 
 @dataclass(frozen=True)

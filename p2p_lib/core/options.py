@@ -105,14 +105,14 @@ _SIZES = _typed(
 )
 
 
-def lengths_m(given: Mapping[str, Any] | None, objects: Iterable[str]) -> dict[str, float]:
+def lengths_m(given: Mapping[str, Any] | None, objects: Iterable[str], fix: str = "") -> dict[str, float]:
     """``{"mug": "9.5"}``, as ``--size mug=9.5`` gives centimetres, to metres.
 
-    :class:`BadInput` for what is no size, or of none of the ``objects``.
+    :class:`BadInput` for what is no size, or, with ``fix``, of none of the ``objects``.
     """
     found: dict[str, float] = {}
     if unknown := sorted((given or {}).keys() - set(objects)):
-        raise BadInput("size", f"the name {unknown[0]!r}", f"one of the objects: {', '.join(objects)}")
+        raise BadInput("size", f"the name {unknown[0]!r}", f"one of the objects: {', '.join(objects)}", fix)
     for name, cm in (given or {}).items():
         try:
             found[name] = float(cm) / 100

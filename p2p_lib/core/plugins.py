@@ -16,7 +16,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from p2p_lib.core.errors import BadInput, MissingBackend, did_you_mean, doubt, in_a_line
+from p2p_lib.core.errors import BadInput, MissingBackend, did_you_mean, doubt, in_a_line, listed
 
 #: What users call a kind where that is another word: --format.
 _SAID = {"dataset": "format"}
@@ -45,6 +45,17 @@ def offered(kind: str) -> dict[str, EntryPoint]:
 def _offered(group: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
     """By name; on one path it is read once, since the files of every installed package are opened for it."""
     return {point.name: point for point in entry_points(group=group)}
+
+
+def loaded(kind: str) -> Iterator[tuple[str, Any]]:
+    """What installed packages offer of a kind, by name; what cannot be loaded is left out, and doubted."""
+    for name, point in offered(kind).items():
+        try:
+            yield name, _theirs(kind, name, point.value)
+        except Exception as error:  # noqa: BLE001 what a package of somebody else's raises says nothing of what is asked
+            package = point.dist.name if point.dist else "an installed package"
+            fix = f"It is left out: mend {package}, or uninstall it."
+            doubt(f"{_SAID.get(kind, kind)} {name!r}, offered by {package}", in_a_line(error), fix)
 
 
 def knows(kind: str, name: str, known: Iterable[str]) -> bool:
@@ -112,7 +123,8 @@ def _theirs(kind: str, name: str, where: str) -> Callable[..., Any]:
         raise MissingBackend(f"{said} {name}", f"{module} {what} ({in_a_line(error)})", fix) from error
     if attribute and not hasattr(found, attribute):
         own = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]
-        near = did_you_mean(attribute, own, f"{module}:")
+        theirs = [key for key in own if getattr(vars(found)[key], "__module__", "") == found.__name__]
+        near = did_you_mean(attribute, own, f"{module}:") or (f"It has {listed(theirs, 8)}." if theirs else "")
         raise BadInput(said, repr(name), f"something called {attribute} in {found.__name__}", near)
     part = getattr(found, attribute) if attribute else found
     call = f"{attribute}({', '.join(CALLED_WITH[kind])})"

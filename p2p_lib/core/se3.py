@@ -156,7 +156,9 @@ def check(name: str, T: np.ndarray, tolerance: float = 1e-4) -> np.ndarray:
         raise BadInput(name, "NaN or infinite entries", "a finite 4x4 transformation")
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > tolerance or np.linalg.det(R) < 0:
-        raise BadInput(name, "a matrix that is not a rotation", "an orthonormal, right-handed 3x3 block")
+        scale = np.cbrt(np.linalg.det(R))
+        got = f"a matrix that is not a rotation (it scales by {scale:.3g})"
+        raise BadInput(name, got, "an orthonormal, right-handed 3x3 block")
     if np.abs(T[3] - IDENTITY[3]).max() > tolerance:
         raise BadInput(name, f"last row {T[3].tolist()}", "0 0 0 1")
     return T

@@ -125,8 +125,7 @@ def _truth(folder: Path, obj: str, numbers: list[int], listed, info: dict[int, l
     for at in (at for at in range(len(numbers)) if obj in listed[at]):
         index, entry = listed[at][obj]
         T = se3.from_rt(np.reshape(entry.cam_R_m2c, (3, 3)), np.array(entry.cam_t_m2c) * MM)
-        T = se3.check(f"{folder / 'scene_gt.json'}: image {numbers[at]}, {obj}", T, images.NOT_RIGID)
-        poses[at] = se3.orthonormalised(T)
+        poses[at] = se3.check(f"{folder / 'scene_gt.json'}: image {numbers[at]}, {obj}", T, images.NOT_RIGID)
         counts = info.get(numbers[at], [])
         labelled[at] = index >= len(counts) or counts[index].px_count_visib > 0
     return ObjectTruth(poses, labelled)

@@ -236,7 +236,7 @@ def _read_tum(path: Path, sequence: Sequence) -> np.ndarray:
     if not rows.size:
         return poses  # lost throughout
     if rows.shape[1] != 8:
-        raise BadInput(str(path), f"{rows.shape[1]} numbers in a line", form)
+        raise BadInput(str(path), f"{rows.shape[1]} numbers in each line", form)
     fits = np.isfinite(rows).all(1) & (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.1)
     if not fits.all():
         worst = int(np.argmin(fits))

@@ -184,10 +184,9 @@ def read_numbers(path: Path, expected: str) -> np.ndarray:
 
 
 def read_poses(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:
-    """(N, 4, 4) from one text file a frame, each the rigid transformation nearest to what is written."""
+    """(N, 4, 4) from one text file a frame, each nearly rigid."""
     files = check_paired(list_files(folder, (".txt",), "pose files"), rgb_files)
-    T = [se3.check(str(p), read_numbers(p, "a 4x4 transformation in metres"), NOT_RIGID) for p in files]
-    return se3.orthonormalised(np.stack(T))
+    return np.stack([se3.check(str(p), read_numbers(p, "a 4x4 transformation in metres"), NOT_RIGID) for p in files])
 
 
 def read_image(path: Path, flags: int, expected: str) -> np.ndarray:

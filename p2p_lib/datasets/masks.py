@@ -61,8 +61,8 @@ def find_masks(
     images, or a single one, of the first image.
     """
     if not folder.is_dir():
-        fix = f"Name a folder inside the sequence, a path, or {', '.join(MASK_SOURCES)}."
-        fix = f"{did_you_mean(folder.name, MASK_SOURCES)} {fix}".strip()
+        fix = f"Name a folder inside the sequence, a path, or {', '.join(dict.fromkeys(MASK_SOURCES))}."
+        fix = did_you_mean(folder.name, MASK_SOURCES) or fix
         raise MissingData(str(folder), "no such folder of masks", fix)
     below = tuple(sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")))
     names = objects or below

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from p2p_lib.core.errors import BadInput, MissingData, in_a_line
+from p2p_lib.core.errors import BadInput, MissingData, doubt, in_a_line
 from p2p_lib.core.files import UNREADABLE, read_bytes
-from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.datasets.sequence import FORMATS, Sequence
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,10 +29,17 @@ LARGEST_M = 10.0
 
 
 def find_models(sequence: Sequence, preferred: tuple[str, ...] = PREFERRED) -> dict[str, Path]:
-    """Object to model file, for those objects that have one where the sequence's layout keeps it."""
+    """Object to model file, for those objects that have one where the sequence's layout keeps it.
+
+    Warns of files that a layout of somebody else's names, and that are not there.
+    """
     found = {}
     for name, places in sequence.model_places.items():
         found[name] = next(filter(None, (model_in(place, preferred) for place in places)), None)
+        files = [str(place) for place in places if place.suffix.lower() in SUFFIXES]
+        if found[name] is None and files and sequence.format not in FORMATS:
+            what, fix = f"model of {name!r} (format {sequence.format})", f"Give one with --models {name}=PATH."
+            doubt(what, f"no file {', '.join(files)}, so that nothing is scored", fix, of=name)
     return {name: path for name, path in found.items() if path is not None}
 
 

@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, doubt, in_a_line
 from p2p_lib.core.paths import data_dir
-from p2p_lib.core.plugins import find, offered
+from p2p_lib.core.plugins import find, loaded
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.images import called_otherwise, gaps_allowed
+from p2p_lib.datasets.images import NOT_RIGID, called_otherwise, gaps_allowed
 
 #: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
 FORMATS: dict[str, tuple[str, ...]] = {
@@ -51,6 +54,8 @@ _VIDEOS = (".mp4", ".avi", ".mov", ".webm", ".m4v")
 LIVE = "live"
 #: Sequences that are generated rather than read are called ``synthetic/NAME``.
 SYNTHETIC = "synthetic/"
+#: How far from the camera objects are, metres, where truth is in metres.
+_TRUE_M = (0.02, 20.0)
 #: Renders those; imported when one is asked for.
 _GENERATOR = "p2p_lib.synthetic"
 
@@ -67,9 +72,12 @@ class ObjectTruth:
     labelled: np.ndarray
 
     def __post_init__(self) -> None:
-        n = len(self.labelled)
-        if self.T_cam_model.shape != (n, 4, 4) or self.labelled.shape != (n,) or self.labelled.dtype != bool:
-            got = f"T_cam_model {self.T_cam_model.shape}, labelled {self.labelled.shape} {self.labelled.dtype}"
+        T, labelled = self.T_cam_model, self.labelled
+        if not (isinstance(T, np.ndarray) and isinstance(labelled, np.ndarray)):
+            got = f"{type(T).__name__} and {type(labelled).__name__}"
+            raise BadInput("truth", got, "arrays (N, 4, 4) and (N,) bool")
+        if T.shape != (len(T), 4, 4) or labelled.shape != (len(T),) or labelled.dtype != bool:
+            got = f"T_cam_model {T.shape}, labelled {labelled.shape} {labelled.dtype}"
             raise BadInput("truth", got, "(N, 4, 4) and (N,) bool")
 
 
@@ -171,13 +179,72 @@ def open_sequence(
         folder, format = _find(path_or_name, format)
         name = os.path.basename(os.path.abspath(folder))
     format = format or recognise(folder)
-    with gaps_allowed(gaps):
+    with gaps_allowed(gaps), _named(format):
         read = (read_folder or _loader(format))(folder, masks)
         if not isinstance(read, ImageSequence):
             what = f"format {format}: what load(folder, masks) gives"
             raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
         read.check_camera()
-    return replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale, scene_seed=seed)
+    found = replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale, scene_seed=seed)
+    return replace(found, read_truth=partial(_truth, found, found.read_truth))
+
+
+@contextmanager
+def _named(format: str) -> Iterator[None]:
+    """What goes wrong in a layout of somebody else's is said with its name; ours say themselves what is wrong."""
+    try:
+        yield
+    except Exception as error:
+        if format in FORMATS or isinstance(error, P2PError):
+            raise
+        what, got = f"format {format}", f"{type(error).__name__} ({in_a_line(error)})"
+        if isinstance(error, OSError):
+            raise MissingData(what, f"its loader could not read a file: {got}") from error
+        raise BadInput(what, got, "a loader that ends without an error", "--debug shows where it was.") from error
+
+
+def _truth(sequence: Sequence, read: Callable[[], Any]) -> dict[str, ObjectTruth]:
+    """What a layout's ``read_truth`` gives, of each frame, each pose made rigid.
+
+    Raises :class:`BadInput` for what is none, and warns of poses where nothing can be, or is to be seen.
+    """
+    with _named(sequence.format):
+        given, whose = read(), f"(format {sequence.format})"
+    if not isinstance(given, dict):
+        raise BadInput(f"truth {whose}", f"a value of type {type(given).__name__}", "a dict, object to ObjectTruth")
+    found = {}
+    for name, of in given.items():
+        what, fix = f"truth of {name!r} {whose}", "Poses of frames without truth are NaN."
+        if not isinstance(of, ObjectTruth):
+            raise BadInput(what, f"a value of type {type(of).__name__}", "an ObjectTruth, see CONTRIBUTING.md")
+        if len(of.labelled) != len(sequence):
+            raise BadInput(what, f"{len(of.labelled)} poses", f"{len(sequence)}, one for each image", fix)
+        T, known = np.array(of.T_cam_model, float), np.isfinite(of.T_cam_model).all((1, 2))
+        for i in np.flatnonzero(known):
+            try:
+                se3.check(f"{what}, row {i}", T[i], NOT_RIGID)
+            except BadInput as error:
+                raise advised(error, f"T_cam_model turns and moves, and scales nothing. {fix}") from None
+        T[known] = se3.orthonormalised(T[known])
+        found[name] = ObjectTruth(T, of.labelled)
+        if wrong := _odd(T[known & of.labelled], sequence.camera):
+            doubt(what, *wrong, of=name)
+    return found
+
+
+def _odd(T_cam_model: np.ndarray, camera: Camera) -> tuple[str, str] | None:
+    """What is odd about an object's poses (n, 4, 4) in frames that show it, and what to do; None where nothing is."""
+    at_m = T_cam_model[:, :3, 3]
+    if not len(at_m):
+        return None
+    away_m = float(np.median(np.linalg.norm(at_m, axis=1)))
+    if not _TRUE_M[0] <= away_m <= _TRUE_M[1]:
+        return f"{away_m:.3g} m from the camera (median)", "Is T_cam_model in metres? Millimetres times 0.001 are."
+    outside = ~((at_m[:, 2] > 0) & camera.inside(camera.project(at_m)))
+    if outside.mean() <= 0.5:
+        return None
+    fix = "T_cam_model is from the model to the camera (x right, y down, z forward): is it inverted, or of other axes?"
+    return f"the model's origin is outside the image in {outside.sum()} of {len(outside)} frames", fix
 
 
 def no_truth_said(sequence: Sequence) -> str:
@@ -311,7 +378,7 @@ def _layout(folder: Path) -> str | None:
 
     def tried() -> Iterator[tuple[str, tuple[str, ...]]]:
         yield from ((name, patterns) for name, patterns in FORMATS.items() if name not in _PLAIN)
-        yield from ((name, getattr(_loader(name), "patterns", ())) for name in offered("dataset"))
+        yield from ((name, getattr(load, "patterns", ())) for name, load in loaded("dataset") if name not in FORMATS)
         yield from ((name, FORMATS[name]) for name in _PLAIN)
 
     return next((name for name, patterns in tried() if any(next(folder.glob(p), None) for p in patterns)), None)

@@ -44,11 +44,16 @@ WHAT_RAN = ("tracker", "masks", "segmenter", "preset", "seed")
 
 
 def ran_with(info: Mapping[str, Any]) -> dict[str, Any]:
-    """What a score says of the run that ``info`` is of; of one without any click, its masks are of memories."""
-    from_memory = (
-        (info.get("options") or {}).get("memory") and info.get("masks") == "clicks" and not info.get("prompts")
-    )
-    return {key: info.get(key) for key in WHAT_RAN} | ({"masks": "memory"} if from_memory else {})
+    """What a score says of the run that ``info`` is of; of one without any click, its masks are of memories.
+
+    With ``changed``, parameters that are not as in the preset, where any was changed.
+    """
+    asked = info.get("options") or {}
+    changed = [f"{key}={value}" for key, value in sorted((asked.get("settings") or {}).items())]
+    changed += [f"by {Path(asked['config_file']).name}"] if asked.get("config_file") else []
+    ran = {key: info.get(key) for key in WHAT_RAN} | ({"changed": ", ".join(changed)} if changed else {})
+    from_memory = asked.get("memory") and info.get("masks") == "clicks" and not info.get("prompts")
+    return ran | ({"masks": "memory"} if from_memory else {})
 
 
 @dataclass(frozen=True, eq=False)

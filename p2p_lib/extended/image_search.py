@@ -41,6 +41,8 @@ _HIDDEN, _SHOWN = 0.5, 0.3
 _STEP_M, _STEPS = 0.03, 2
 #: A pose's share is reduced by this per metre from the proposal, so that of equal ones the nearest is taken.
 _STAY_PER_M = 2.0
+#: And by this per logarithm of its light: a light table beside a dark thing has its colours in more light.
+_IN_ITS_LIGHT = 1.0
 #: The search compares one in so many points, and so many of its best poses are aligned.
 _COARSE, _TRIED = 3, 3
 #: So many turns are aligned, this far apart, rad, shifted by this step about the depth points, m.
@@ -88,12 +90,19 @@ class Sighting:
     share      points of the surface that show less those contradicted, over those that should show
     uv_px      (K, 2) where points were found on the surface in their colour
     measured   points that were found on the surface, in their colour or not; 0 for few, or in another light
+    light      how much lighter these are than they were, as a logarithm
     """
 
     T_cam_obj: np.ndarray
     share: float
     uv_px: np.ndarray
     measured: int = 0
+    light: float = 0.0
+
+    @property
+    def rank(self) -> float:
+        """What poses of one frame are compared by."""
+        return self.share - _IN_ITS_LIGHT * abs(self.light)
 
     @property
     def alike(self) -> float:
@@ -199,13 +208,13 @@ class ImageSearch:
 
     def _roughly(self, poses: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """(H,) shares by some of the points, -inf where unknown."""
-        return self._compare(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)[0]
+        return self._ranked(poses, sample.select(np.arange(0, len(sample), _COARSE)), _ROUGH_M)
 
     def _best(
         self, found: list[Sighting], sample: SurfaceSample, proposed: np.ndarray | None = None
     ) -> Sighting | None:
         """The best of some, polished, near the ``proposed`` pose (4, 4) if any; None where none is good enough."""
-        best = max(found, key=lambda s: s.share - _strayed(s.T_cam_obj, proposed, sample), default=None)
+        best = max(found, key=lambda s: s.rank - _strayed(s.T_cam_obj, proposed, sample), default=None)
         if best is None or best.share < _PROMISING or not self._distinct(best, sample):
             return None
         return self.at(self._polished(best, sample, proposed), sample)
@@ -217,7 +226,7 @@ class ImageSearch:
         along = axes * np.ptp(centred @ axes.T, axis=0)[:, None]
         poses = np.repeat(found.T_cam_obj[None], 4, 0)
         poses[:, :3, 3] += np.concatenate([along, -along]) @ found.T_cam_obj[:3, :3].T
-        share, *_ = self._compare(poses, sample, _FINE_M)
+        share = self._ranked(poses, sample, _FINE_M, found.light)
         return (share > _ANYWHERE * found.share).sum() < 2
 
     def _polished(self, found: Sighting, sample: SurfaceSample, proposed: np.ndarray | None) -> np.ndarray:
@@ -226,14 +235,16 @@ class ImageSearch:
         about, back = se3.from_rt(np.eye(3), centre), se3.from_rt(np.eye(3), -centre)
         for scale in _POLISH_SCALES:
             poses = T_cam_obj @ about @ se3.exp(scale * _NEARBY) @ back
-            share, *_ = self._compare(poses, sample, _FINE_M)
+            share = self._ranked(poses, sample, _FINE_M)
             T_cam_obj = poses[(share - _strayed(poses, proposed, sample)).argmax()]
         return se3.orthonormalised(T_cam_obj)
 
     def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The evidence of one pose; None where too little of the surface would show."""
-        (share,), (found,), (uv_px,), (measured,) = self._compare(T_cam_obj[None], sample, _FINE_M)
-        return Sighting(T_cam_obj, float(share), uv_px[found], int(measured)) if np.isfinite(share) else None
+        (share,), (found,), (uv_px,), (measured,), (light,) = self._compare(T_cam_obj[None], sample, _FINE_M)
+        if not np.isfinite(share):
+            return None
+        return Sighting(T_cam_obj, float(share), uv_px[found], int(measured), float(light))
 
     def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """The pose after robust point-to-plane alignment with the points measured at its pixels."""
@@ -245,10 +256,18 @@ class ImageSearch:
             T_cam_obj = se3.from_rt(R, centre - R @ centre + step[3:]) @ T_cam_obj
         return T_cam_obj
 
+    def _ranked(self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float, light: float = 0.0) -> np.ndarray:
+        """(H,) shares of poses, less where they need another ``light``; -inf where unknown."""
+        share, *_, lights = self._compare(T_cam_obj, sample, near_m)
+        return share - _IN_ITS_LIGHT * np.abs(lights - light)
+
     def _compare(
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Shares (H,), -inf where unknown; found (H, M) bool; their pixels (H, M, 2); how many are measured (H,)."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Shares (H,), -inf where unknown; found (H, M) bool; their pixels (H, M, 2).
+
+        And how many are measured (H,), in which light (H,).
+        """
         arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, sample.lab, self._depth_m, self._lab
         return _compare(*arrays, self._lens, self._noise, near_m, _FEWEST * len(sample) / _POINTS)
 
@@ -293,6 +312,7 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
     share, measured_on, found = np.full(poses, -np.inf), np.zeros(poses, np.int64), np.zeros((poses, points), np.bool_)
     uv_px, lighter = np.full((poses, points, 2), np.nan), np.zeros(points)  # how much lighter, by its logarithm
+    light = np.zeros(poses)
     for h in range(poses):
         T = T_cam_obj[h]
         facing, shown, hidden, behind, on, exposure = 0, 0, 0, 0, 0, 0.0
@@ -325,22 +345,24 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
                 lighter[m] = np.log((seen[row, column, 0] + 8.0) / (lab[m, 0] + 8.0))
                 found[h, m], on, exposure = True, on + 1, exposure + lighter[m]
         agree = 0
+        if on > 0:
+            light[h] = exposure / on
         for m in range(points):
             if found[h, m]:
                 # Lightness is compared with the mean change: the exposure may have changed.
                 column, row = int(np.rint(uv_px[h, m, 0])), int(np.rint(uv_px[h, m, 1]))
                 a, b = float(seen[row, column, 1]) - lab[m, 1], float(seen[row, column, 2]) - lab[m, 2]
-                same = np.sqrt(a * a + b * b) < _CHROMA and abs(lighter[m] - exposure / on) < _LIGHTNESS
+                same = np.sqrt(a * a + b * b) < _CHROMA and abs(lighter[m] - light[h]) < _LIGHTNESS
                 found[h, m] = same
                 agree += same
-        if on > 0 and abs(exposure / on) > _EXPOSED:
+        if abs(light[h]) > _EXPOSED:
             agree = 0
             found[h] = False
         elif on >= fewest:
             measured_on[h] = on
         if shown >= fewest and shown >= _SHOWN * facing:
             share[h] = (agree - behind) / max(shown + _HIDDEN * hidden, 1.0)
-    return share, found, uv_px, measured_on
+    return share, found, uv_px, measured_on, light
 
 
 def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: SurfaceSample) -> np.ndarray:

@@ -160,5 +160,10 @@ class Table:
 
     def _lettered_notes(self, letter: str, escape: Callable[[str], str] = str) -> list[str]:
         """What stands below the table: its notes with their letters, then those of the whole."""
-        noted = [letter.format(name) + escape(note) + "." for note, name in self.letters().items()]
-        return [*noted, *(escape(note) + "." for note in self.notes)]
+        noted = [letter.format(name) + _ended(escape(note)) for note, name in self.letters().items()]
+        return [*noted, *(_ended(escape(note)) for note in self.notes)]
+
+
+def _ended(sentence: str) -> str:
+    """With its full stop, unless it ends already."""
+    return sentence if sentence.endswith((".", "?")) else f"{sentence}."

@@ -1,4 +1,4 @@
-"""The object-centric keypoint map (paper: section "Sampling Strategy", appendix "Point Promotion Strategy").
+"""The object-centric keypoint map (section "Sampling Strategy and Keypoints Map", appendix "Point Promotion Strategy").
 
 New points are pending until they have proved themselves over several frames in a row; promoted ones
 are keypoints p_n in the object frame that frames are registered to. Where the main text (a score

@@ -1,8 +1,8 @@
 """What an object's step leaves open, and the paper's answers: propose, choose, judge, admit, request.
 
 :class:`~p2p_lib.method.object_tracker.ObjectTracker` asks these questions in its step. The paper takes the hypothesis
-that lies nearest to the surface, accepts every pose that it finds, and learns from every frame with a pose (Sec.
-"Object Registration", appendix "Sampling Criteria").
+that lies nearest to the surface, accepts every pose that it finds, and learns from every frame with a pose (section
+"Frame-to-Map Registration for Pose Estimation", appendix "Sampling Criteria").
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 The paper takes the hypothesis whose dense points lie nearest to the surface (rule "surface"). Ours (rule "support")
 keeps the one that most keypoints agree with, unless the surface prefers another one significantly: that one fits the
-surface, and is nearer to it by more than a small margin and ``surface_sigmas`` standard errors of the mean difference.
+surface, and is nearer to it by more than a small margin and up to ``surface_sigmas`` standard errors of the mean
+difference: the fewer, the more keypoints agree with it, too.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from p2p_lib.method.registration import Hypothesis
 _MARGIN_M = 2e-4
 #: The mean distance of a pose that fits is smaller; else the map is bent, or depth and colour are out of step, m.
 _FITS_M = 0.004
+#: However many keypoints agree with it, too, this share of the standard errors is asked for.
+_LEAST = 0.5
 
 
 def select(
@@ -36,22 +39,24 @@ def select(
         return None, "no hypothesis: too few correspondences agree"
     if len(hypotheses) == 1:
         return 0, "the only hypothesis"
-    best, scores = _best(hypotheses, weight), _scores(distance_m)
+    support, scores = np.array([h.support for h in hypotheses]) * (1 if weight is None else weight), _scores(distance_m)
+    best = _best(hypotheses, support)
     if distance_m is None or scores is None:
         return best, "most inliers; there is no surface to compare with"
     nearest = int(np.argmin(scores))
     if config.rule == "support":
         nearer = distance_m[best] - distance_m[nearest]
-        chance = config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer)) if np.isfinite(nearer).all() else 0.0
+        fewer = max(1 - support[nearest] / max(support[best], 1e-9), _LEAST)
+        chance = fewer * config.surface_sigmas * np.std(nearer) / np.sqrt(len(nearer))
+        chance = chance if np.isfinite(nearer).all() else 0.0
         preferred = scores[best] - scores[nearest] > max(chance, _MARGIN_M) and scores[nearest] < _FITS_M
         if not preferred:
-            return best, "most inliers; the hypotheses fit the surface equally well"
+            return best, "most inliers; the surface does not prefer another one beyond chance"
     return nearest, f"nearest to the surface ({1e3 * scores[nearest]:.2f} mm)"
 
 
-def _best(hypotheses: Sequence[Hypothesis], weight: np.ndarray | None) -> int:
-    """The hypothesis with most support, then with the least mean residual."""
-    support = np.array([h.support for h in hypotheses]) * (1 if weight is None else weight)
+def _best(hypotheses: Sequence[Hypothesis], support: np.ndarray) -> int:
+    """The hypothesis with most support (H,), then with the least mean residual."""
     residual_m = np.array([h.residual_m[h.inliers].mean() if h.support else np.inf for h in hypotheses])
     return int(np.lexsort((residual_m, -support))[0])
 

@@ -212,8 +212,9 @@ def _write_obj(folder: Path, mesh: Mesh) -> None:
 def _settings(name: str, seed: int, overrides: dict) -> tuple[dict, Sensor]:
     """The scenario's own parameters and the sensor; unknown names and keys are refused."""
     if name not in SCENARIOS:
+        meant = did_you_mean(name, SCENARIOS, SYNTHETIC)
         known = "one of " + ", ".join(SYNTHETIC + k for k in sorted(SCENARIOS))
-        raise BadInput("synthetic sequence", repr(name), known, did_you_mean(name, SCENARIOS, SYNTHETIC))
+        raise BadInput("synthetic sequence", f"{name!r} ({meant})" if meant else repr(name), known)
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise BadInput(f"{SYNTHETIC}{name} seed", repr(seed), "a whole number, 0 or above")
     taken = list(inspect.signature(SCENARIOS[name]).parameters.values())[1:]

@@ -635,7 +635,9 @@ def test_a_known_size_that_does_not_fit_is_to_be_looked_at(sequence, tmp_path, c
     third = ["run", str(sequence), "--out", str(tmp_path / "third")]
     for words in (["eval", str(tmp_path / "run")], third, ["check", str(sequence)]):
         assert cli.main([*words, "--size", "mug=9"]) == 2
-        assert "size: got the name 'mug', expected one of the objects: object" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "size: got the name 'mug', expected one of the objects: object" in said
+        assert ("--prompts FILE" in said) == (words[0] == "check"), "which reads names there where it is given"
     assert cli.main(["eval", str(tmp_path / "run"), "--size", "object=long"]) == 2
     assert "its longest side in centimetres" in capsys.readouterr().err
     shutil.rmtree(sequence / "annotated_poses")
@@ -876,7 +878,10 @@ BAD_WORDS = {
         ["run", "{seq}", "--out", "{out}", "--set", "foo.bar=1"],
         ["'foo.bar'", "stage.key", "lifecycle, "],
     ),
-    "unknown scenario": (["synth", "crosing", "--out", "{out}"], ["'crosing'", "Did you mean synthetic/crossing?"]),
+    "unknown scenario": (
+        ["synth", "crosing", "--out", "{out}"],
+        ["got 'crosing' (Did you mean synthetic/crossing?), expected"],
+    ),
     "click into a file": (["click", "{seq}", "--out", "{seq}/cam_K.txt/x"], ["cam_K.txt/x", "can be written"]),
     "click into a folder": (["click", "{seq}", "--out", "{seq}/rgb"], ["slide/rgb", "a folder"]),
     "negative seed": (["run", "{seq}", "--out", "{out}", "--seed", "-1"], ["seed", "-1"]),
@@ -922,6 +927,20 @@ def test_bad_words_are_answered_in_one_line(case, sequence, done, tmp_path, caps
     assert cli.main([*words[:2], *more, *words[2:]]) == 2
     line = one_line(capsys, words[0])
     assert all(word in line for word in expected), line
+
+
+def test_an_export_says_how_many_poses_it_leaves_out(done, tmp_path, capsys):
+    shutil.copytree(done, tmp_path / "run")
+    with np.load(tmp_path / "run/poses.npz") as kept:
+        parts = dict(kept)
+    (key,) = (key for key in parts if key.endswith("confidence"))
+    parts[key][:3] = 0.2
+    np.savez(tmp_path / "run/poses.npz", **parts)
+    words = ["export", str(tmp_path / "run"), "--format", "tum", "--out"]
+    assert cli.main([*words, str(tmp_path / "some"), "--min-confidence", "0.3"]) == 0
+    left_out = f"3 of {len(parts[key])} poses left out, of a confidence below 0.3"
+    assert left_out in capsys.readouterr().err
+    assert cli.main([*words, str(tmp_path / "all")]) == 0 and "left out" not in capsys.readouterr().err
 
 
 DAMAGE = {

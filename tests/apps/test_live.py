@@ -1091,7 +1091,7 @@ def test_what_was_dropped_while_the_first_masks_were_made_is_said(folder):
     options = RunOptions(settings=SETTINGS)
     count = track_live(camera, PROMPTS, lambda estimate: None, options, LiveOptions(say=said.append))
     assert (count.frames, count.dropped) == (3, 5)
-    assert said[-1] == "4 images came while the first masks were made, and were dropped"
+    assert said[-1] == "4 images came while the first frame was worked on, and were dropped"
 
 
 class AtOnce(Scripted):

@@ -83,6 +83,11 @@ def course_problems(path: Path) -> list[str]:
     names = [one.name for one in LESSONS]
     problems = [] if f'lesson("{path.stem[:2]}")' in code[0] else ["does not begin with its lesson"]
     problems += [f"{call} without a caption" for source in code for call in uncaptioned(source)]
+    problems += [
+        f"{call} is not the last of its cell, so it is not shown" for source in code for call in unshown(source)
+    ]
+    literals = "\n".join(cell.source for cell in cells if "parameters" in tags(cell)).splitlines()
+    problems += [f"says nothing of its parameter {line}" for line in literals if "#" not in line]
     if len(answers(path)) < 2:
         problems.append(f"has {len(answers(path))} exercises with an answer in code, not two or more")
     links = set(re.findall(r"\]\((\w+)\.ipynb\)", "\n".join(text)))
@@ -109,6 +114,13 @@ def uncaptioned(source: str) -> list[str]:
             if len(words.split()) < 6 or not words.endswith("."):
                 found.append(ast.unparse(node)[:60])
     return found
+
+
+def unshown(source: str) -> list[str]:
+    """Calls that save a picture and whose answer, which shows it, is dropped: a cell shows its last line alone."""
+    calls = [one.value for one in ast.parse(source).body[:-1] if isinstance(one, ast.Expr)]
+    saving = [call for call in calls if isinstance(call, ast.Call) and getattr(call.func, "id", "").startswith("save_")]
+    return [ast.unparse(call)[:60] for call in saving]
 
 
 def answers(path: Path) -> list[str]:
@@ -343,13 +355,17 @@ def test_a_kernel_that_dies_is_a_failure(tmp_path):
     [
         (
             {"parameters": {"SED": 1}},
-            "00_a parameter: got SED, expected one of PROFILE, SEED, SCALE, NAME. Did you mean",
+            "00_a parameter: got SED, expected one of SEED, SCALE, NAME. Did you mean SEED?",
         ),
         ({"parameters": {"SEED": "many"}}, "00_a parameter SEED: got 'many', expected int like 0"),
         ({"parameters": {"SEED": True}}, "00_a parameter SEED: got True, expected int like 0"),
         ({"parameters": {"NAME": 3}}, "00_a parameter NAME: got 3, expected str like 'a'"),
         ({"profile": "fast"}, "profile: got 'fast', expected one of quick, full"),
-        ({"parameters": {"sed": 1}, "only": ["0"]}, "00_a parameter: got sed, expected one of PROFILE, SEED"),
+        ({"parameters": {"sed": 1}, "only": ["0"]}, "00_a parameter: got sed, expected one of SEED, SCALE"),
+        (
+            {"parameters": {"PROFILE": "huge"}},
+            "parameter: got PROFILE, expected one of a notebook's others. The profile is chosen by --profile",
+        ),
         ({"only": ["07"]}, "notebook: got '07', expected one of 00_a, 01_b"),
         ({"jobs": 0}, "jobs: got 0, expected at least 1"),
     ],
@@ -384,7 +400,7 @@ def test_what_runs_with_other_values_goes_beside_and_not_over(tmp_path, monkeypa
 def test_a_parameter_must_be_known_to_all_notebooks_that_run(tmp_path):
     write(tmp_path / "00_a.ipynb")
     write(tmp_path / "01_b.ipynb", parameters="PROFILE = 'quick'")
-    with pytest.raises(BadInput, match=r"01_b parameter: got SEED, expected one of PROFILE\. Pick the"):
+    with pytest.raises(BadInput, match=r"01_b parameter: got SEED, expected none: it has none\. Pick the"):
         run_notebooks(out=tmp_path / "out", folder=tmp_path, parameters={"SEED": 1}, say=lambda line: None)
 
 
@@ -496,3 +512,8 @@ def test_all_claims_that_fail_are_named():
 )
 def test_pictures_without_captions_are_seen(source, found):
     assert len(uncaptioned(source)) == found
+
+
+def test_a_picture_that_is_not_shown_is_seen():
+    assert unshown("save_figure(f, 'a', c)\n{'n': 1}") == ["save_figure(f, 'a', c)"]
+    assert unshown("print(1)\nx = save_figure(f, 'a', c)\nsave_table(t, 'b')") == []

@@ -53,6 +53,13 @@ def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_pa
     assert what_to_fetch(load_benchmark("ablation_embedded", tmp_path)) == []
 
 
+def test_what_is_there_and_only_not_run_yet_is_not_missing(nothing, tmp_path, monkeypatch):
+    monkeypatch.setenv("P2P_DATA", str(tmp_path))
+    write_sequence(tmp_path / "YCBInEOAT/mustard0", 6, 2, seed=2)
+    (line,) = what_to_fetch(load_benchmark("ycbineoat", tmp_path / "out"))
+    assert "ycbineoat/mustard_easy_00_02" in line and "mustard0" not in line
+
+
 def test_plans_whose_data_is_there_are_found(nothing, tmp_path, monkeypatch):
     assert present_plans() == []
     monkeypatch.setenv("P2P_DATA", str(tmp_path))

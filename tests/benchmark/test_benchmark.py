@@ -191,6 +191,14 @@ def test_a_killed_benchmark_resumes_to_the_identical_table(whole, plan, tmp_path
     assert (done.folder / "summary.csv").read_bytes() == (whole.folder / "summary.csv").read_bytes()
 
 
+def test_a_long_reason_keeps_what_to_do(tmp_path):
+    def fail(job, out):
+        raise BadInput("tracker", "'lkk'", "one of " + ", ".join(f"tracker_{k}" for k in range(99)), "Did you mean lk?")
+
+    reason = perform(fail, SimpleNamespace(key="a"), tmp_path, library_version()).reason
+    assert reason.startswith("tracker: got 'lkk'") and reason.endswith("Did you mean lk?") and len(reason) <= 500
+
+
 def test_a_failing_run_is_a_row_and_the_others_go_on(slides, plan, tmp_path, capsys, here):
     broken = Path(shutil.copytree(slides[0], tmp_path / "broken"))
     (broken / "rgb/0004.png").write_bytes(b"no picture")
@@ -333,9 +341,15 @@ def test_sigterm_ends_the_command_itself_and_nothing_is_left(plan, tmp_path):
         time.sleep(0.01)
     ran.send_signal(signal.SIGTERM)
     out, err = ran.communicate(timeout=300)  # the end of its output is that of all its processes
-    assert ran.returncode == 128 + signal.SIGTERM and err.splitlines()[-1] == "p2p benchmark: interrupted", err
+    goes_on = f"p2p benchmark: interrupted. Go on with it: p2p benchmark {plan} --out {tmp_path}"
+    assert ran.returncode == 128 + signal.SIGTERM and err.splitlines()[-1] == goes_on, err
     assert "semaphore" not in err and "Traceback" not in err
     assert 1 <= len(list(tmp_path.glob("records/*.json"))) < 8 and " 0 failed, " in out
+
+
+def test_what_is_stale_is_not_made_anew_in_part(capsys):
+    assert cli.main(["benchmark", "--stale", "--quick"]) == 2
+    assert "got --stale with --quick, expected one of them" in capsys.readouterr().err
 
 
 def test_an_interrupted_plan_replaces_no_table_that_was_made(plan, tmp_path, monkeypatch, capsys):
@@ -348,7 +362,9 @@ def test_an_interrupted_plan_replaces_no_table_that_was_made(plan, tmp_path, mon
     table.parent.mkdir()
     table.write_text("as it was")
     assert cli.main(["benchmark", str(plan), *options, "--tables", str(table.parent)]) == 130
-    assert table.read_text() == "as it was" and "2 not run" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert table.read_text() == "as it was" and "2 not run" in out and f"not run yet: p2p benchmark {plan}" in out
+    assert err.endswith(f"Go on with it: p2p benchmark {plan} --out {tmp_path} --quick\n")
 
 
 def test_interrupted_figures_say_so_and_draw_nothing(tmp_path, monkeypatch, capsys):

@@ -24,6 +24,8 @@ def test_histograms_hold_every_scored_frame_once(whole):
         shares = [patch.get_data().values.sum() for patch in axis.patches]
         beyond = [line.get_ydata()[0] for line in axis.get_lines() if line.get_marker() == "x"]
         np.testing.assert_allclose(np.add(shares, beyond), 100)
+        first, second = (patch.get_linewidth() for patch in axis.patches)
+        assert first > second, "which lies on it, and may be the same"
 
 
 def test_a_strip_has_a_line_for_each_method(whole):
@@ -50,6 +52,9 @@ def test_a_tracks_error_is_its_distance_from_the_true_keypoint(whole):
 def test_tracks_are_drawn_where_they_are_known(whole):
     figure = final_figures.tracks_by_error(whole, "Ours", count=2)
     assert len(figure.axes) == 3, "two images and the scale"
+    words = [axis.get_title(loc="left") for axis in figure.axes[:2]]
+    least, most = (float(title.removeprefix("ADD ").removesuffix(" mm")) for title in words)
+    assert least < most, "the best pose first"
 
 
 def test_a_reconstruction_that_was_not_made_is_said(whole):
@@ -70,7 +75,7 @@ def test_results_in_full_are_shown_and_the_quick_form_runs_where_there_are_none(
     assert [b.profile for b in full.values()] == ["full"]
     nothing = load_benchmark(plan, tmp_path)
     assert nothing.counts() == {"done": 0, "failed": 0, "not run": 8}
-    assert {outcome.reason for _, outcome in nothing.results} == {"not run yet: p2p benchmark slides"}
+    assert {outcome.reason for _, outcome in nothing.results} == {f"not run yet: p2p benchmark {plan}"}
     assert not any(tmp_path.iterdir()), "looking leaves nothing behind"
     (unasked,) = final_figures.results_to_show([name], tmp_path, "quick", []).values()
     assert unasked.counts() == {"done": 0, "failed": 0, "not run": 2}

@@ -12,7 +12,7 @@ import pytest
 from p2p_lib.benchmark import execution, plan_names, read_plan
 from p2p_lib.benchmark.execution import measured
 from p2p_lib.benchmark.jobs import _present, jobs_of
-from p2p_lib.benchmark.plan import PROMPTS, Method, PlannedSequence, prompts_file, prompts_places
+from p2p_lib.benchmark.plan import PROMPTS, Method, Plan, PlannedSequence, Scope, prompts_file, prompts_places
 from p2p_lib.core.backends import DETECTORS, TRACKERS
 from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.options import RunOptions
@@ -247,6 +247,9 @@ SMALL += '[full]\nseeds = [0]\nsequence = [{ name = "a" }]\n'
         ("[quick]", '[[method]]\nname = "Ours"\n[quick]', "two methods have one name"),
         ("seeds = [0]", 'seeds = [0]\nmethods = ["Theirs"]', "no method is called 'Theirs'"),
         ('title = "t"', "title = ", "unreadable TOML"),
+        ('name = "a" }', 'name = "a", start = 50, stop = 5 }', r"a: start = 50, stop = 5: that is no frame"),
+        ('name = "Ours"', 'name = "Ours"\nonly = ["b"]', r"only: no sequence is called 'b' \(There are a\.\)"),
+        ('name = "Ours"', 'name = "Ours"\nbut = ["ab"]', r"but: no sequence is called 'ab' \(Did you mean a\?\)"),
         (
             'name = "Ours"',
             'name = "Ours"\nformat = "bop"',
@@ -279,6 +282,63 @@ def test_a_parameter_that_does_not_fit_names_plan_and_method(tmp_path, line, mes
     (tmp_path / "small.toml").write_text(SMALL.replace('name = "Ours"', f'name = "Ours"\n{line}'))
     with pytest.raises(BadInput, match=rf"^plan small, method 'Ours': {message}"):
         jobs_of(read_plan(tmp_path / "small.toml"), "full")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"Ours"', '"Ours"\ntracker = "lkk"', r"^plan small, method 'Ours': tracker: got 'lkk', .* Did you mean lk\?"),
+        ('"Ours"', '"Ours"\ndetector = "cornrs"', r"method 'Ours': detector: got 'cornrs', .* Did you mean corners\?"),
+        ('"Ours"', '"Ours"\nmasks = "click"', r"masks of synthetic/mug: got 'click', .* Did you mean clicks\?"),
+        ("synthetic/mug", "synthetic/mgu", r"got 'synthetic/mgu', .* Did you mean synthetic/mug\?"),
+        ('mug"', 'mug", objects = ["mugg"]', r"objects of synthetic/mug: got 'mugg', .* Did you mean mug\?"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_anything_is_rendered(tmp_path, monkeypatch, old, new, message):
+    monkeypatch.setenv("P2P_CACHE", str(tmp_path / "cache"))
+    small = SMALL.replace('"a"', '"synthetic/mug"')
+    (tmp_path / "small.toml").write_text(small)
+    assert all(job.key for job in jobs_of(read_plan(tmp_path / "small.toml"), "full"))
+    assert old in small
+    (tmp_path / "small.toml").write_text(small.replace(old, new))
+    with pytest.raises(BadInput, match=message):
+        jobs_of(read_plan(tmp_path / "small.toml"), "full")
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_sequence_that_cannot_be_scored_or_has_no_such_object_says_so(tmp_path, monkeypatch):
+    """Of files the line says why; the plan's other sequences run."""
+    board = write_sequence(tmp_path / "board", 6, 2)
+    own = "p2p_lib.datasets.ycbineoat:load"
+
+    def reasons(**more):
+        planned = {"name": str(board), "models": {}} | more
+        method = Method(name="Ours", masks=planned.pop("masks", "dataset"))
+        scope = Scope(seeds=[0], sequence=[PlannedSequence(**planned)])
+        return [job.reason for job in jobs_of(Plan(name="p", title="t", method=[method], full=scope), "full")]
+
+    assert reasons() == [""]
+    assert "objects of" in reasons(objects=["objct"])[0] and "Did you mean object?" in reasons(objects=["objct"])[0]
+    assert "Did you mean clicks?" in reasons(masks="click")[0]
+    assert "got start = 9, expected one of its 6 frames" in reasons(start=9)[0]
+    for model in (board / "models").rglob("*.*"):
+        model.unlink()
+    assert "models of object: none at" in reasons()[0]
+    with monkeypatch.context() as patch:
+        patch.setattr("p2p_lib.datasets.ycbineoat.np.ones", lambda n, kind: np.full(n - 1, True))
+        assert "truth: got T_cam_model (6, 4, 4), labelled (5,)" in reasons(format=own)[0]
+
+
+def test_a_changed_tracker_of_ones_own_is_another_run(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code = tmp_path / "my_changing_tracker.py"
+    code.write_text("def made(config, rng): ...\n")
+    small = SMALL.replace('"a"', '"synthetic/mug"').replace('"Ours"', '"Ours"\ntracker = "my_changing_tracker:made"')
+    (tmp_path / "small.toml").write_text(small)
+    (before,), (same,) = (jobs_of(read_plan(tmp_path / "small.toml"), "full") for _ in range(2))
+    code.write_text("def made(config, rng): return 1\n")
+    (after,) = jobs_of(read_plan(tmp_path / "small.toml"), "full")
+    assert before.key == same.key != after.key
 
 
 def test_a_plan_may_do_without_a_quick_profile_which_is_then_refused(tmp_path):

@@ -27,7 +27,8 @@ def test_the_rows_of_a_run_are_those_of_the_benchmark(whole, printed):
     key = next(outcome.key for job, outcome in whole.results if job.method.name == "Ours")
     mine = [row for row in printed(str(whole.out / "runs" / key)) if row["object"] == "object" and row["value"]]
     theirs = [row for row in whole.rows if row["key"] == key and row["object"] == "object"]
-    same = ("metric", "form", "failures", "align", "unit", "frames", "lost", "tracker", "detector", "masks", "preset")
+    same = "metric form failures align unit frames lost tracker detector masks preset changed".split()
+    assert {row["changed"] for row in mine} == {"method.graph=False, method.surface=False"}
     assert [[r[c] for c in same] for r in mine] == [[str(r[c]) for c in same] for r in theirs]
     assert [float(r["value"]) for r in mine] == [r["value"] for r in theirs]
     assert {(r["form"], r["failures"], r["align"]) for r in mine if r["metric"] == "ADD AUC"} == {

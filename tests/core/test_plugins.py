@@ -141,6 +141,22 @@ def test_a_layout_of_others_is_recognised_or_named(theirs, sequence):
         assert open_sequence(sequence, format=name).format == name
 
 
+def test_a_broken_layout_of_others_is_left_out_unless_it_is_named(theirs, sequence):
+    lost = "\n[p2p_lib.datasets]\nmarked = their_parts:load\nlost = their_lost_parts:load\n"
+    entries = theirs / "their_parts-1.0.dist-info" / "entry_points.txt"
+    entries.write_text(OFFERED.partition("\n[p2p_lib.datasets]")[0] + lost)
+    plugins._offered.cache_clear()
+    shutil.rmtree(sequence / "annotated_poses")
+    (sequence / "gt_mask").rename(sequence / "masks")
+    with pytest.warns(
+        Doubt, match=r"^format 'lost', offered by their-parts: .*their_lost_parts.* left out: mend their-p"
+    ):
+        assert recognise(sequence) == "folder"
+    with pytest.raises(MissingBackend, match=r"^format lost: their_lost_parts cannot be imported"):
+        open_sequence(sequence, format="lost")
+    plugins._offered.cache_clear()
+
+
 def test_what_lies_in_the_working_folder_is_meant_where_another_has_its_name(theirs, tmp_path, monkeypatch):
     """As ``p2p`` is started: the folder is on the path, and last, so that none of its files stands in for a library."""
     (tmp_path / "their_parts.py").write_text(CODE.replace('name = "mine"', 'name = "mine, changed"'))
@@ -279,6 +295,8 @@ def test_a_part_whose_methods_are_called_otherwise_is_refused_before_anything_ru
 def test_a_near_name_is_one_that_can_be_called(theirs):
     with pytest.raises(BadInput, match=r"something called load_it in their_parts. Did you mean their_parts:load\?"):
         make_tracker("their_parts:load_it", preset().tracking)
+    with pytest.raises(BadInput, match=r"something called Nope in their_parts\. It has Mine, Dots, Cutter, .* more\.$"):
+        make_tracker("their_parts:Nope", preset().tracking)
     (theirs / "their_parts.py").write_text("import numpy as nq")
     sys.modules.pop("their_parts")
     with pytest.raises(BadInput, match=r"something called nd in their_parts$"):

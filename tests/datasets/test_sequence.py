@@ -1,6 +1,7 @@
 """Opening sequences: recognition, names, times, masks, truth, in every layout."""
 
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -348,6 +349,87 @@ def test_what_a_loader_of_somebody_elses_puts_together_is_checked(tmp_path, monk
         return
     with pytest.raises(BadInput, match=how["said"]):
         open_sequence(tmp_path / "own", format="their_layout:load")
+
+
+def own_layout(monkeypatch, folder, read_truth, **more):
+    """A sequence of a layout of somebody else's with this truth."""
+
+    def load(folder, masks):
+        rgb, depth = (tuple(sorted((folder / part).iterdir())) for part in ("rgb", "depth"))
+        return ImageSequence(
+            folder, rgb, depth, Camera.from_K(K, W, H), np.arange(N) / 30, read_truth=read_truth, **more
+        )
+
+    monkeypatch.setitem(sys.modules, "their_layout", SimpleNamespace(load=load))
+    return open_sequence(folder, format="their_layout:load")
+
+
+def scaled(by, at_m=0.5):
+    T = se3.from_rt(se3.exp(np.c_[np.linspace(0, 0.3, N), np.zeros((N, 5))])[:, :3, :3], [0, 0, at_m])
+    T[:, :3, :3] *= by
+    return T
+
+
+def first_wrong(T):
+    T = T.copy()
+    T[0], T[2, :3, :3] = np.nan, 1.3 * T[2, :3, :3]
+    return T
+
+
+EACH = np.ones(N, bool)
+OF = r"^truth of 'mug' \(format their_layout:load\)"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (lambda: {"mug": ObjectTruth(first_wrong(POSES), EACH)}, OF + r", row 2: .* \(it scales by 1\.3\), .* NaN"),
+        (lambda: {"mug": ObjectTruth(POSES * [1, 1, -1, 1], EACH)}, OF + ", row 0: .*right-handed"),
+        (lambda: {"mug": ObjectTruth(POSES[:3], EACH[:3])}, OF + r": got 3 poses, expected 4, one for each image\."),
+        (lambda: {"mug": POSES}, OF + r": got a value of type ndarray, expected an ObjectTruth"),
+        (lambda: {"mug": ObjectTruth(POSES.tolist(), EACH)}, r"truth: got list and ndarray, expected arrays"),
+        (lambda: POSES, r"^truth \(format their_layout:load\): got a value of type ndarray, expected a dict"),
+        (lambda: {"mug": {}["poses"]}, r"^format their_layout:load: got KeyError \('poses'\), expected a loader"),
+    ],
+)
+def test_truth_of_somebody_elses_that_cannot_be_names_loader_object_and_row(tmp_path, monkeypatch, given, said):
+    sequence = own_layout(monkeypatch, write_pictures(tmp_path / "own"), given)
+    with pytest.raises(BadInput, match=said):
+        _ = sequence.truth
+
+
+def test_a_file_that_a_loader_does_not_find_is_named_with_it(tmp_path, monkeypatch):
+    def read_truth():
+        raise FileNotFoundError("poses_v2.npy")
+
+    sequence = own_layout(monkeypatch, write_pictures(tmp_path / "own"), read_truth)
+    with pytest.raises(MissingData, match=r"^format their_layout:load: .* FileNotFoundError \(poses_v2\.npy\)"):
+        _ = sequence.truth
+    sequence = own_layout(monkeypatch, sequence.path, dict, model_places={"mug": (tmp_path / "mug.ply",)})
+    with pytest.warns(Doubt, match=r"model of 'mug' \(format their_layout:load\): no file .*mug\.ply"):
+        assert find_models(sequence) == {}
+
+
+@pytest.mark.parametrize(
+    ("T", "said"),
+    [
+        (scaled(1.003), None),
+        (scaled(1, 500.0), r"500 m from the camera \(median\)\. Is T_cam_model in metres"),
+        (scaled(1, 0.0005), r"0\.0005 m from the camera"),
+        (se3.inverse(scaled(1)), r"outside the image in 4 of 4 frames\. .* is it inverted"),
+    ],
+)
+def test_truth_is_made_rigid_and_doubted_where_nothing_can_be_seen(tmp_path, monkeypatch, T, said):
+    T[0] = np.nan if said is None else T[0]
+    sequence = own_layout(monkeypatch, write_pictures(tmp_path / "own"), lambda: {"mug": ObjectTruth(T, EACH)})
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        found = sequence.truth["mug"].T_cam_model
+    assert np.isnan(found[0]).all() == (said is None)
+    np.testing.assert_allclose(found[1:, :3, :3] @ found[1:, :3, :3].swapaxes(1, 2), [np.eye(3)] * 3, atol=1e-12)
+    assert len(doubts) == (said is not None)
+    if said:
+        assert doubts[0].message.object == "mug" and re.search(said, str(doubts[0].message))
 
 
 def test_opening_is_light():

@@ -245,6 +245,14 @@ def test_mean_rate_and_what_ran_are_reported_in_exactly_these_keys():
     assert all(word in table for word in ("cup", "mug", "mean", "100", "75", "66.2 Hz", "aligned by first"))
 
 
+def test_a_score_says_which_parameters_are_not_the_presets():
+    run = a_run(mug=object_run(*2 * [motion(np.random.default_rng(13))]))
+    run.info["options"] = {"settings": {"tsdf.voxel_m": "0.004", "method.graph": "off"}, "config_file": "/at/own.toml"}
+    assert (
+        "preset default, seed 4, changed method.graph=off, tsdf.voxel_m=0.004, by own.toml" in evaluate(run).as_table()
+    )
+
+
 def test_objects_that_cannot_be_scored_are_left_out_with_the_reason():
     truth = motion(np.random.default_rng(14))
     none = np.full((N, 4, 4), np.nan)

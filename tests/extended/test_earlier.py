@@ -49,8 +49,10 @@ def test_clicks_on_what_has_moved_are_refused_until_a_newer_image_is_clicked_on(
             each.step(THEN)
         method.add_object("left", clicks=ON["left"], frame=THEN)
         found = method.step(now)
-        why = "prompt of 'left' in frame 0: got what has moved by frame 9, expected what stands still meanwhile. "
-        assert found["left"].reason == str(method.refused["left"]) == why + "Click again on a newer image."
+        why = (
+            "prompt of 'left' in frame 0: got pixels that have changed by frame 9, expected what stands still meanwhile"
+        )
+        assert found["left"].reason == str(method.refused["left"]) == f"{why}. Click again on a newer image."
         assert found["left"].status is Status.INITIALISING and not method.masks["left"]
         assert_same([{"right": found["right"]}], [alone.step(now)])
         method.correct("left", clicks=clicks_on(masks["left"]), frame=now)

@@ -156,9 +156,11 @@ def plate() -> SurfaceSample:
     return replace(sample_of_the_ball(), p_obj=p[:300], n_obj=np.tile([0.0, 0, -1], (300, 1)))
 
 
-def test_what_fits_anywhere_proves_nothing():
-    """A plain plate on a plain wall of its colour fits everywhere along it."""
-    flat = Frame(0, 0.0, np.full((240, 320, 3), BLUE, np.uint8), np.full((240, 320), 0.6, np.float32))
+@pytest.mark.parametrize("gain", [1.0, 0.6])
+def test_what_fits_anywhere_proves_nothing(gain):
+    """A plain plate on a plain wall of its colour fits everywhere along it, in another light, too."""
+    colour = (gain * np.array(BLUE)).astype(np.uint8)
+    flat = Frame(0, 0.0, np.tile(colour, (240, 320, 1)), np.full((240, 320), 0.6, np.float32))
     assert search(flat).at(PLACE, plate()).share > 0.9
     assert search(flat).about(PLACE, plate()) is None
 
@@ -245,3 +247,21 @@ def test_of_many_places_those_that_differ_are_looked_at():
     ]
     for centre in (PLACE[:3, 3], beside[:3, 3]):
         assert np.linalg.norm(found - centre, axis=1).min() < 0.005
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.45])
+def test_a_dark_thing_on_a_light_table_is_found_where_it_lies(hidden):
+    """In the light of a sunny day all of the table beside it would have its colour; and there nothing hides it."""
+    dark, light = (75, 75, 75), (150, 150, 150)
+    along, across = np.linspace(-RADIUS_M, RADIUS_M, 30), np.linspace(-RADIUS_M / 5, RADIUS_M / 5, 10)
+    p_obj = np.stack(np.meshgrid(along, across, [0.0]), -1).reshape(-1, 3)
+    sample = replace(sample_of_the_ball(dark), p_obj=p_obj, n_obj=np.tile([0.0, 0, -1], (300, 1)))
+    rgb, depth_m = np.full((240, 320, 3), light, np.uint8), np.full((240, 320), 0.6, np.float32)
+    (left, top), (right, bottom) = (
+        CAMERA.project(PLACE[:3, 3] + at).round().astype(int) for at in (p_obj[0], p_obj[-1])
+    )
+    rgb[top : bottom + 1, left : right + 1] = dark
+    covered = np.s_[top - 5 : bottom + 5, left : round(left + hidden * (right - left))]
+    rgb[covered], depth_m[covered] = (150, 100, 90), 0.5
+    found = search(Frame(0, 0.0, rgb, depth_m)).about(PLACE, sample)
+    assert found is not None and np.linalg.norm((found.T_cam_obj - PLACE)[:3, 3]) < 0.012

@@ -228,6 +228,11 @@ def test_latex_has_groups_rules_and_notes():
     ]
 
 
+def test_a_note_that_asks_has_one_mark():
+    lines = Table("t", ["a"], [[Cell(note="Did you mean lk?")]], notes=["Why?", "So."]).markdown()
+    assert all(f"{end}\n" in f"{lines}\n" or f"{end} " in lines for end in ("lk?", "Why?", "So.")) and "?." not in lines
+
+
 def test_what_did_not_run_says_why(tmp_path):
     failed = Outcome(key="k", status="failed", reason="BadInput: a broken picture.")
     missing = Outcome(key="", status="not run", reason="bleach: $P2P_DATA is not set.")

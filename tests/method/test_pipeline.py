@@ -858,7 +858,9 @@ def test_a_late_object_is_clicked_while_another_has_masks():
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     assert iou(method.masks["right"], masks["right"]) > 0.85
     method.correct("right", clicks=clicks_on(film()[14][1]["right"]))
-    with pytest.warns(Doubt, match="correction of 'right': mask of 'right': a mask and clicks in frame 14. It is"):
+    with pytest.warns(
+        Doubt, match="correction of 'right': it is ignored: mask of 'right': got a mask and clicks in frame 14"
+    ):
         estimates = method.step(film()[14][0], film()[14][1])
     assert {str(e.status) for e in estimates.values()} == {"tracked"}
     np.testing.assert_array_equal(method.masks["right"], film()[14][1]["right"])
@@ -1015,11 +1017,10 @@ def test_a_correction_without_depth_is_doubted_and_changes_nothing():
         expected = alone.step(frame)
         if k == 3:
             method.correct("left", clicks=at)
-            with pytest.warns(Doubt, match=r"correction of 'left'.* has no depth in frame 3. It is ignored"):
+            with pytest.warns(Doubt, match=r"correction of 'left': it is ignored: .* has no depth in frame 3"):
                 estimates = method.step(frame)
-            assert "has no depth in frame 3. It is ignored" in estimates["left"].reason, (
-                "whoever reads that alone knows"
-            )
+            told = estimates["left"].reason
+            assert "it is ignored" in told and "has no depth in frame 3" in told, "whoever reads that alone knows"
             estimates["left"] = replace(estimates["left"], reason=expected["left"].reason)
         else:
             estimates = method.step(frame)

@@ -34,6 +34,20 @@ def test_ours_goes_by_the_surface_only_beyond_chance(sigmas, gap, wins):
     assert row == int(wins) and ("nearest" in reason) == wins
 
 
+@pytest.mark.parametrize(
+    ("support", "weight", "gap", "wins"),
+    [(8, 1, 4, False), (8, 1, 5, True), (40, 1, 3, True), (40, 0.1, 3, False), (80, 1, 2, False)],
+    ids=["few against it", "few and surer", "half as many", "half as many, off its motion", "as many, within chance"],
+)
+def test_the_more_points_agree_with_it_too_the_less_sure_the_surface_has_to_be(support, weight, gap, wins):
+    """A glossy mug's mirror image holds most of the points, and the mug half as many; a stray pose holds a few."""
+    noise = np.random.default_rng(0).normal(0, 1, 400)
+    nearer = ((noise - noise.mean()) / noise.std() + gap / np.sqrt(400)) * 2.5e-3
+    distance_m = np.stack([0.003 + nearer, np.full(400, 0.003)])
+    both = [made(80), replace(made(support), residual_m=np.full(100, 0.002))]
+    assert select(both, distance_m, DEFAULT, np.array([1, weight]))[0] == int(wins)
+
+
 @pytest.mark.parametrize(("gap_m", "wins"), [(1.9e-4, False), (2.1e-4, True)])
 def test_ours_needs_a_margin_too(gap_m, wins):
     distance_m = np.tile([[0.002], [0.002 - gap_m]], 50)  # certain, but is it enough?

@@ -52,6 +52,14 @@ def test_a_click_is_where_one_would_click():
     assert np.hypot(*(prompt.points_px[0] - [80, 60])) < 2
 
 
+def test_clicks_are_spread_over_an_object():
+    long = (np.abs(U - 80) <= 60) & (np.abs(V - 60) <= 15)
+    (prompt,) = own_data.spread_clicks({"bar": long, "hidden": np.zeros_like(DISC)}, frame=3)
+    u, v = prompt.points_px.astype(int).T
+    assert (prompt.name, prompt.frame) == ("bar", 3) and long[v, u].all() and len(u) == 3
+    assert u.min() < 40 and u.max() > 120 and (np.abs(v - 60) < 15).all()
+
+
 def test_portraits_show_the_surface_from_its_sides():
     body = trimesh.creation.box((0.05, 0.2, 0.1))
     front = np.array([200, 30, 30, 255], np.uint8)
