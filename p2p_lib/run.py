@@ -108,6 +108,8 @@ def run(
     doubts, if_exists = Doubts(), if_exists if redo_from is None else "resume"
     with waiting_for("Reading the sequence", progress), noted(doubts):
         job = _prepare(sequence, options, progress)
+        if options.stop is not None and options.stop > len(job.sequence):
+            say(f"stop {options.stop}: {job.sequence.name} has {len(job.sequence)} frames alone")
         sizes_m = lengths_m(options.sizes, job.objects)
         _check_free(job, Path(out), if_exists)
         _doubt_camera(job)
@@ -252,6 +254,7 @@ def _prepare(sequence: str | Path | sequences.Sequence, options: RunOptions, pro
         raise BadInput(f"memory of {both[0]!r}", "a prompt of it, too", "a memory or a prompt", "Leave the prompt out.")
     if not prompted and all(sequence.masks(i) is None for i in frames):
         fix = "Click on the objects (p2p click SEQ --out prompts.json) and add --prompts prompts.json."
+        fix += " With --batch, each recording's prompts.json lies in its folder."
         fix = "Leave --masks out: the prompts start the objects." if prompts else fix
         expected = "masks of the first image at least, or clicks"
         raise BadInput("masks", f"none in frames {frames[0]} to {frames[-1]} of {sequence.name}", expected, fix)

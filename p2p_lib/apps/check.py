@@ -104,6 +104,8 @@ def check_folder(
         opened = open_sequence(sequence, format, depth_scale, gaps=True)
     except P2PError as error:
         own = isinstance(sequence, str | Path) and format in (None, "folder")
+        if own and (side_by_side := _pairs_by_name(Path(str(sequence)).expanduser())):
+            return [side_by_side]
         return (_files(Path(str(sequence)).expanduser()) if own else []) or [_unreadable("files", error)]
     sequence = opened
     frames, masks, wrong = _looked_at(sequence)
@@ -183,6 +185,14 @@ def _blamed(unit: Finding, findings: list[Finding]) -> list[Finding]:
     after = {id(f): replace(f, level=Level.LOOK, fix=f"If the unit is right ({unit.name}): {f.fix}") for f in follow}
     first = {id(unit): replace(unit, level=Level.WRONG)} if follow else {}
     return [(first | after).get(id(f), f) for f in findings]
+
+
+def _pairs_by_name(folder: Path) -> Finding | None:
+    """Whether colour and depth images lie side by side, as 7-Scenes ships them, which no layout has."""
+    if not (any(folder.glob("*.color.*")) and any(folder.glob("*.depth.*"))):
+        return None
+    fix = "Put the colour images into rgb/, those of depth, registered to colour, into depth/, and write cam_K.txt."
+    return Finding("files", Level.WRONG, f"{folder}: pairs of *.color.* and *.depth.*, as in 7-Scenes", fix)
 
 
 def _unreadable(name: str, error: P2PError, otherwise: str = "", more: str = "") -> Finding:

@@ -37,6 +37,8 @@ def _click(a: argparse.Namespace) -> None:
     shown = load_run(a.run) if a.run is not None else None
     if shown is not None and (of := shown.info["sequence"]) != sequence.name:
         warn(f"p2p click: {a.run} is a run of {of}, not of {sequence.name}: is it the right one?")
+    if shown is not None and shown.info["masks"] != "dataset" and not shown.mask_folder.is_dir():
+        warn(f"p2p click: {a.run} kept no masks, so none are shown: p2p run --save-masks keeps them")
     page = Clicker(sequence, a.out, a.frame, a.port, shown)
     before = page.prompts
     prompts = wait_for_clicks(page, partial(print, flush=True), not a.no_browser)

@@ -58,7 +58,9 @@ class Camera:
             raise BadInput(name, f"shape {K.shape}", "a 3x3 camera matrix")
         pinhole = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
         if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K - pinhole).max() > 1e-6:
-            raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0")
+            turned = K[2, 2] == 1 and K[2, 0] > 0 and K[2, 1] > 0 and not K[:2, 2].any()
+            fix = "Is it transposed? cx and cy end the first and the second row." * bool(turned)
+            raise BadInput(name, " ".join(f"{x:g}" for x in K.ravel()), "fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0", fix)
         try:
             return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), int(width), int(height))
         except BadInput as error:

@@ -16,10 +16,12 @@ from p2p_lib.core.native import load_open3d
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import folder
-from p2p_lib.datasets.sequence import is_recording, open_sequence
+from p2p_lib.datasets.sequence import RECORDINGS, is_recording, open_sequence
 
 #: The ends of a file that tell a RealSense recording from others of ROS.
 _LOOKED_AT, _REALSENSE = 1 << 20, b"/device_0/sensor_"
+
+_TEXTS = (".log", ".txt", ".csv", ".json", ".yaml", ".md")
 
 
 def convert(
@@ -41,6 +43,9 @@ def convert(
     """
     check_new(out)
     if not is_recording(Path(source)):
+        if Path(source).is_file() and Path(source).suffix.lower() in _TEXTS:
+            fix = f"Give a recording ({' '.join(RECORDINGS)}, or a folder of ROS 2), or a folder of images."
+            raise BadInput(str(source), "a text file", "what a camera recorded", fix)
         sequence = open_sequence(source, format, depth_scale)
         folder.write(sequence, out)
         return len(sequence)

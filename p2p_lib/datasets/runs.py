@@ -241,10 +241,14 @@ class Run:
         objects = {name: obj.select(kept) for name, obj in self.objects.items()}
         return replace(self, objects=objects, timings={key: rows[: kept.sum()] for key, rows in self.timings.items()})
 
+    @property
+    def mask_folder(self) -> Path:
+        """Where the masks that served are, one folder an object, if they were kept."""
+        return self.path / self.info.get("masks_in", "") / "masks"
+
     def masks(self, sequence: Sequence, frame: int) -> dict[str, np.ndarray]:
         """Object to (H, W) bool at a frame of the sequence: the masks that were kept, else those of its that served."""
-        where = self.path / self.info.get("masks_in", "") / "masks"
-        kept = {name: where / name / f"{frame:06d}.png" for name in self.objects}
+        kept = {name: self.mask_folder / name / f"{frame:06d}.png" for name in self.objects}
         if any(path.is_file() for path in kept.values()):
             shape = sequence.camera.height, sequence.camera.width
             return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}

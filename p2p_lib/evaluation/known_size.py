@@ -6,7 +6,7 @@ Both agree with themselves: everything is longer or shorter by one factor, poses
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,8 @@ LONGER, SLACK_M, SHORTER = 1.15, 0.01, 0.7
 _ACROSS = 2**0.5
 #: Points of a surface that are measured, and the share of them at either end that is not: shreds at its rim.
 _POINTS, _SHREDS = 4000, 0.01
-#: By such a factor everything is longer than known where the length was given in metres for centimetres.
-_IN_METRES = 80, 125
+#: By this factor everything is longer than known where the length was given in metres for centimetres.
+_CM_IN_M = 100
 _MASKS = "in its masks"
 #: After so many masks that were measured it is said that they are too long.
 _SOON = 30
@@ -55,7 +55,7 @@ class Lengths:
             return ""
         factor = float(np.median(off))
         text = f"known to be {100 * self.known_m:g} cm long, measured {self._found}, {factor:.2f} times"
-        if _IN_METRES[0] < factor < _IN_METRES[1]:
+        if all(replace(self, known_m=_CM_IN_M * self.known_m)._fits(*of) for of in self._measured.items()):
             return f"{text}: sizes are in centimetres, {100 * self.known_m:g} may be metres"
         mask = "its length was never in view" if factor < 1 else "masks hold more than the object"
         return f"{text}: {mask}, or focal length or depth scale is wrong by about this factor"

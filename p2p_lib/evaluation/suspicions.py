@@ -247,8 +247,10 @@ def _size(e: RunEvidence) -> Suspicion | None:
     size_m = round(median_of_known(e.size_m[known]), 3)
     if not known.any() or SHORTEST_M <= size_m <= LONGEST_M:
         return None
-    than = f"longer than {100 * LONGEST_M:g}" if size_m > LONGEST_M else f"shorter than {100 * SHORTEST_M:g}"
-    text = f"the mask spans {100 * size_m:.4g} cm, {than} cm: does it hold other things, or is the depth unit wrong?"
+    long = f"longer than {100 * LONGEST_M:g} cm: does it hold other things"
+    short = f"shorter than {100 * SHORTEST_M:g} cm: is it a part of the object alone"
+    than = long if size_m > LONGEST_M else short
+    text = f"the mask spans {100 * size_m:.4g} cm, {than}, or is the depth unit wrong?"
     return _suspicion("size", text, e, known & ((e.size_m > LONGEST_M) | (e.size_m < SHORTEST_M)), known)
 
 

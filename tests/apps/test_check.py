@@ -706,3 +706,10 @@ def test_of_all_that_are_far_away_one_is_judged_and_a_known_size_says_that_they_
     assert [f.name for f in check_folder(folder) if f.name.endswith(": depth")] == ["box: depth"]
     run(folder, tmp_path / "run", stop=1, sizes={"box": 100.0}, settings=POINTS_ALONE, progress=False)
     assert not any(" m away, where depth" in str(doubt.message) for doubt in recwarn)
+
+
+def test_pairs_side_by_side_are_told_how_to_be_put(tmp_path):
+    for kind in ("color.jpg", "depth.png"):
+        (tmp_path / f"frame-000000.{kind}").touch()
+    (found,) = check_folder(tmp_path)
+    assert "as in 7-Scenes" in found.text and "into rgb/" in found.fix

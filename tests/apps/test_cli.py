@@ -205,8 +205,9 @@ def test_on_a_terminal_what_is_waited_for_is_one_line_that_goes_away(sequence, t
 
 
 def test_replacing_a_run_is_said(sequence, tmp_path, capsys):
-    assert run(sequence, tmp_path / "out", "--seed", "4") == 0
-    assert "replaces" not in capsys.readouterr().err
+    assert run(sequence, tmp_path / "out", "--seed", "4", "--stop", "3000") == 0
+    err = capsys.readouterr().err
+    assert "replaces" not in err and f"stop 3000: slide has {FRAMES} frames alone" in err
     assert run(sequence, tmp_path / "out", "--stop", "3", "--force") == 0
     err = capsys.readouterr().err
     assert re.search(rf"out held a run of slide \({FRAMES} frames, tracker \S+, seed 4\), which this one replaces", err)
@@ -860,6 +861,7 @@ BAD_WORDS = {
     ),
     "unknown format": (["run", "{seq}", "--out", "{out}", "--format", "bop5"], ["format: got 'bop5'", "ycbineoat"]),
     "unknown masks": (["run", "{seq}", "--out", "{out}", "--masks", "sam9"], ["sam9: no such folder of masks", "sam2"]),
+    "misspelt masks": (["run", "{seq}", "--out", "{out}", "--masks", "click"], ["Did you mean clicks?"]),
     "no mask folder": (["run", "{seq}", "--out", "{out}", "--masks", "dataset:"], ["masks: got 'dataset:'"]),
     "mask folder missing": (["run", "{seq}", "--out", "{out}", "--masks", "dataset:nowhere"], ["nowhere"]),
     "unknown key": (

@@ -413,7 +413,8 @@ def test_the_page_of_a_run_begins_with_what_the_run_was_started_from(sequence, o
     monkeypatch.setattr("p2p_lib.apps.click.wait_for_clicks", lambda page, *_: page.prompts)
     elsewhere = shutil.copytree(sequence.path, tmp_path / "elsewhere")
     assert cli.main(["click", str(elsewhere), "--out", str(out), "--run", str(tmp_path / "run")]) == 0
-    assert "is a run of own, not of elsewhere: is it the right one?" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "is a run of own, not of elsewhere: is it the right one?" in said and "kept no masks" in said
 
 
 def test_the_server_says_what_mask_the_clicks_make(sequence, out):

@@ -181,7 +181,7 @@ def K_with(at: tuple[int, int], value: float) -> np.ndarray:
         (K_with((0, 0), 0.0), "fx 0 cx"),
         (K_with((1, 1), -600.0), "-600"),
         (K_with((2, 2), 2.0), "0 0 2"),
-        (CAMERA.K.T, "fx 0 cx 0 fy cy 0 0 1"),
+        (CAMERA.K.T, "fx 0 cx 0 fy cy 0 0 1.* Is it transposed?"),
         (K_with((0, 1), 3.0), "fx 0 cx"),
         (K_with((2, 0), 1.0), "fx 0 cx"),
         (np.array([[0.94, 0, 0.5], [0, 1.25, 0.5], [0, 0, 1]]), "fx = 0.94 for 640 columns, expected .* in pixels"),

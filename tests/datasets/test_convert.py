@@ -348,3 +348,9 @@ def test_an_azure_kinects_recording_is_what_open3d_reads(tmp_path, monkeypatch):
     same(open_sequence(tmp_path / "out"))
     with pytest.raises(BadInput, match=r"film\.mkv: got what is no recording of an Azure Kinect"):
         convert(tmp_path / "film.mkv", tmp_path / "none", progress=False)
+
+
+def test_a_text_file_is_no_recording(tmp_path):
+    (tmp_path / "int.log").write_text("started")
+    with pytest.raises(BadInput, match=r"a text file, expected what a camera recorded\. Give a recording"):
+        convert(tmp_path / "int.log", tmp_path / "out")

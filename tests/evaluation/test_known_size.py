@@ -69,4 +69,6 @@ def test_two_faces_of_a_cube_are_no_longer_cube(tmp_path):
 
 def test_a_size_in_metres_is_told_from_a_wrong_camera():
     assert "sizes are in centimetres, 0.12 may be metres" in Lengths(0.0012, 0.13, 0.12).doubt
+    assert "0.08 may be metres" in Lengths(0.0008, 0.113).doubt, "from corner to corner"
+    assert "may be metres" not in Lengths(0.0008, 0.02).doubt
     assert "focal length" in Lengths(0.06, 0.13, 0.12).doubt

@@ -93,7 +93,8 @@ def test_what_is_away_may_be_lost(rows, says):
 
 def test_a_length_does_not_read_as_the_limit_that_it_exceeds():
     full = np.ones(N)
-    for size_m, says in ((0.0196, ""), (0.01954, ""), (0.0194, "spans 1.9 cm, shorter than 2 cm"), (0.6004, "")):
+    short = "spans 1.9 cm, shorter than 2 cm: is it a part of the object alone"
+    for size_m, says in ((0.0196, ""), (0.01954, ""), (0.0194, short), (0.6004, "")):
         found = [s.text for s in suspicions(replace(spotless(), size_m=size_m * full)) if s.rule == "size"]
         assert len(found) == bool(says) and says in "".join(found), size_m
 
