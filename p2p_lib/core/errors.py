@@ -73,6 +73,10 @@ def advised(error: P2PError, fix: str) -> P2PError:
     return error
 
 
+#: The kind of doubt by which a run says that it moves depth onto its colour.
+DEPTH_MOVED = "depth moved"
+
+
 class Doubt(UserWarning):
     """What can be meant, and most often is not: tracking goes on.
 

@@ -31,7 +31,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, Doubt, MissingData
+from p2p_lib.core.errors import DEPTH_MOVED, BadInput, Doubt, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
 from p2p_lib.core.options import located
 from p2p_lib.core.paths import full
@@ -229,7 +229,7 @@ class Run:
     def doubts(self) -> tuple[Doubt, ...]:
         """What was doubted while it was made; earlier versions wrote the text alone."""
         said = self.info.get("doubts") or ()
-        return tuple(Doubt(of) if isinstance(of, str) else Doubt(**of) for of in said)
+        return tuple(_earlier_doubt(of) if isinstance(of, str) else Doubt(**of) for of in said)
 
     def until(self, frame: int) -> Run:
         """The run as it was before a frame; :class:`BadInput` for one that has none before it, or was not reached."""
@@ -254,6 +254,11 @@ class Run:
             return {name: read_labels(path, shape) > 0 for name, path in kept.items() if path.is_file()}
         masks = (sequence.masks(frame) if self.info["masks"] == "dataset" else None) or {}
         return {name: masks[name] for name in self.objects if name in masks}
+
+
+def _earlier_doubt(text: str) -> Doubt:
+    """A doubt of a run of an earlier version: of its kinds the one that says how depth was taken is known by words."""
+    return Doubt(text, kind=DEPTH_MOVED if "of different moments while the camera moves" in text else "")
 
 
 def load_run(folder: str | Path, every_map: bool = False) -> Run:

@@ -16,6 +16,7 @@ import numpy as np
 
 from p2p_lib.core import tables
 from p2p_lib.core.camera import Camera
+from p2p_lib.core.errors import DEPTH_MOVED
 from p2p_lib.core.types import DOUBTED, median_of_known
 from p2p_lib.datasets.keypoint_log import ObjectKeypoints, load_keypoints
 from p2p_lib.datasets.mask_log import load_masks
@@ -25,7 +26,6 @@ from p2p_lib.evaluation.evidence import ON_M, depth_as_taken, gathered, reprojec
 from p2p_lib.evaluation.known_size import lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, suspicions
-from p2p_lib.extended.depth_lag import DEPTH_MOVED
 
 if TYPE_CHECKING:
     from pandas import DataFrame

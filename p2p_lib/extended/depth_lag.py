@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from p2p_lib.core.depth_edges import brightness_edges, near_sides
-from p2p_lib.core.errors import Doubt
+from p2p_lib.core.errors import DEPTH_MOVED, Doubt
 from p2p_lib.core.types import Frame
 
 if TYPE_CHECKING:
@@ -37,8 +37,6 @@ _MIN_FIT, _MIN_GAIN = 0.3, 0.1
 #: A way that is too short to tell, as a fraction of the image's width; and an offset after which a camera is known to
 #: take the two apart, so that smaller ones are no noise: of cameras that take both together 0.015 is found at most.
 _SHORT, _OFF = 0.005, 0.02
-#: The kind of doubt by which a run says that it moves depth onto its colour.
-DEPTH_MOVED = "depth moved"
 
 
 class DepthLag:

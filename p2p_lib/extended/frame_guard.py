@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from p2p_lib.core.depth import far_depth
-from p2p_lib.core.errors import doubt
+from p2p_lib.core.errors import DEPTH_MOVED, doubt
 from p2p_lib.core.types import Frame
-from p2p_lib.extended.depth_lag import DEPTH_MOVED, DepthLag
+from p2p_lib.extended.depth_lag import DepthLag
 
 #: Depth, colour or both may repeat for so long, s: some cameras deliver one of them less often.
 _STANDS_S = 0.08

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import Doubt
+from p2p_lib.core.errors import DEPTH_MOVED, Doubt
 from p2p_lib.core.image import in_mask
 from p2p_lib.datasets.keypoint_log import KeypointLog
 from p2p_lib.datasets.mask_log import MaskLog, load_masks
@@ -15,7 +15,6 @@ from p2p_lib.datasets.models import MESHES, find_models, load_mesh, load_points
 from p2p_lib.datasets.runs import COLUMNS, NOT_FOLLOWED, load_run
 from p2p_lib.evaluation.consistency import HEADS, Consistency, consistency
 from p2p_lib.evaluation.evidence import on_surface
-from p2p_lib.extended.depth_lag import DEPTH_MOVED
 from tests.fixtures.made_run import T_OBJ_MODEL
 
 OFF_PX = 2.0
@@ -77,6 +76,9 @@ def test_what_was_doubted_when_it_was_made_is_to_be_looked_at(made, run):
 def test_doubts_of_earlier_versions_are_of_all_that_was_read(made, run):
     told = consistency(replace(run, info=run.info | {"doubts": ["flat"]}), made.sequence).suspicions
     assert [[s.text for s in told[name]] for name in ("box", "can")] == [["flat"], ["flat"]]
+    moved = "depth and colour: of different moments while the camera moves, 14 px apart in frame 76. Depth is moved."
+    earlier = replace(run, info=run.info | {"doubts": [moved]})
+    assert [doubt.kind for doubt in earlier.doubts] == [DEPTH_MOVED], "and depth is taken as it was then"
 
 
 def test_a_removed_object_is_no_lost_one(made, run, tmp_path):

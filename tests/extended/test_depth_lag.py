@@ -9,12 +9,12 @@ import trimesh
 
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import preset
-from p2p_lib.core.errors import Doubt
+from p2p_lib.core.errors import DEPTH_MOVED, Doubt
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.runs import ObjectRun
 from p2p_lib.evaluation.evidence import depth_as_taken, surface_in_view
 from p2p_lib.extended.default import compose
-from p2p_lib.extended.depth_lag import DEPTH_MOVED, DepthLag
+from p2p_lib.extended.depth_lag import DepthLag
 from p2p_lib.extended.frame_guard import FrameGuard
 from p2p_lib.figures.playback import Playback
 from p2p_lib.offline.finished import Finished
