@@ -41,8 +41,9 @@ _HIDDEN, _SHOWN = 0.5, 0.3
 _STEP_M, _STEPS = 0.03, 2
 #: A pose's share is reduced by this per metre from the proposal, so that of equal ones the nearest is taken.
 _STAY_PER_M = 2.0
-#: And by this per logarithm of its light: a light table beside a dark thing has its colours in more light.
-_IN_ITS_LIGHT = 1.0
+#: And by what its light is more than this off what it was, a logarithm: a light table beside a dark thing has its
+#: colours in more light.
+_IN_ITS_LIGHT = 0.25
 #: The search compares one in so many points, and so many of its best poses are aligned.
 _COARSE, _TRIED = 3, 3
 #: So many turns are aligned, this far apart, rad, shifted by this step about the depth points, m.
@@ -102,7 +103,7 @@ class Sighting:
     @property
     def rank(self) -> float:
         """What poses of one frame are compared by."""
-        return self.share - _IN_ITS_LIGHT * abs(self.light)
+        return self.share - max(abs(self.light) - _IN_ITS_LIGHT, 0.0)
 
     @property
     def alike(self) -> float:
@@ -259,7 +260,7 @@ class ImageSearch:
     def _ranked(self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float, light: float = 0.0) -> np.ndarray:
         """(H,) shares of poses, less where they need another ``light``; -inf where unknown."""
         share, *_, lights = self._compare(T_cam_obj, sample, near_m)
-        return share - _IN_ITS_LIGHT * np.abs(lights - light)
+        return share - np.maximum(np.abs(lights - light) - _IN_ITS_LIGHT, 0)
 
     def _compare(
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
