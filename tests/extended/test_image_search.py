@@ -252,7 +252,7 @@ def test_of_many_places_those_that_differ_are_looked_at():
 @pytest.mark.parametrize("hidden", [0.0, 0.3])
 def test_a_dark_thing_on_a_light_table_is_found_where_it_lies(hidden):
     """In the light of a sunny day all of the table beside it would have its colour; and there nothing hides it."""
-    dark, light = (75, 75, 75), (150, 150, 150)
+    dark, light = (66, 66, 66), (150, 150, 150)
     along, across = np.linspace(-RADIUS_M, RADIUS_M, 30), np.linspace(-RADIUS_M / 5, RADIUS_M / 5, 10)
     p_obj = np.stack(np.meshgrid(along, across, [0.0]), -1).reshape(-1, 3)
     sample = replace(sample_of_the_ball(dark), p_obj=p_obj, n_obj=np.tile([0.0, 0, -1], (300, 1)))
