@@ -39,7 +39,7 @@ class Exact:
         h = 0.5 * self.voxel_m
         gradient = [(self.query(p + h * e)[0] - self.query(p - h * e)[0]) / (2 * h) for e in np.eye(3)]
         value, valid = self.query(p)
-        return value, np.stack(gradient, -1), valid
+        return value, np.asfortranarray(np.stack(gradient, -1)), valid
 
 
 def noisy(depth, rng, sigma_m=0.0015):
