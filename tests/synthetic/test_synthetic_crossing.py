@@ -299,7 +299,7 @@ def test_unwritable_cache_says_what_to_do(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "seed", "overrides", "message"),
     [
-        ("crosing", 0, {}, "'crosing', expected one of .*synthetic/crossing"),
+        ("crosing", 0, {}, r"'crosing' \(Did you mean synthetic/crossing\?\), expected one of"),
         ("crossing", -1, {}, "seed: got -1"),
         ("crossing", 0.5, {}, "seed: got 0.5"),
         ("crossing", 0, {"contrst": 1}, "'contrst', expected one of frames, contrast"),
