@@ -28,7 +28,8 @@ from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_im
 from p2p_lib.datasets.masks import MaskFiles
 from p2p_lib.datasets.models import load_mesh, load_points, read_mesh
 from p2p_lib.datasets.schema import read_json
-from p2p_lib.datasets.sequence import ObjectTruth, Sequence
+from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.datasets.truth import ObjectTruth
 
 MM = 0.001
 Nine = Annotated[list[float], Field(min_length=9, max_length=9)]

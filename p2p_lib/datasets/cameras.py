@@ -21,7 +21,8 @@ from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput, P2PError, WrongSize, advised, doubt, wrong_size
 from p2p_lib.core.plugins import check_part, find, is_place
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import LIVE, ObjectTruth, Sequence, open_sequence
+from p2p_lib.datasets.sequence import LIVE, Sequence, open_sequence
+from p2p_lib.datasets.truth import ObjectTruth
 
 DEFAULT_RATE_HZ = 30.0
 #: So many frames may wait: a search or a keyframe takes as long as some frames, and those after it make up for that.

@@ -23,7 +23,7 @@ from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, camera_for, paired_images
 from p2p_lib.datasets.pickles import load_plain
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.truth import ObjectTruth
 
 OBJECT = "object"
 MASKS = ("masks", "masks_XMem")

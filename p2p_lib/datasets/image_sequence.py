@@ -18,7 +18,7 @@ from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.masks import MaskFiles, find_masks
 from p2p_lib.datasets.schema import read_json
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.truth import ObjectTruth
 
 #: Of a SHA-256, enough to tell images from others.
 _DIGITS = 16

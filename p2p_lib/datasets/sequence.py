@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -18,13 +18,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, doubt, in_a_line
+from p2p_lib.core.errors import BadInput, MissingData, P2PError, doubt, in_a_line
 from p2p_lib.core.paths import data_dir
 from p2p_lib.core.plugins import find, loaded
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.images import NOT_RIGID, called_otherwise, gaps_allowed
+from p2p_lib.datasets.images import called_otherwise, gaps_allowed
+from p2p_lib.datasets.truth import ObjectTruth, checked_truth
 
 #: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
 FORMATS: dict[str, tuple[str, ...]] = {
@@ -55,31 +55,8 @@ _VIDEOS = (".mp4", ".avi", ".mov", ".webm", ".m4v")
 LIVE = "live"
 #: Sequences that are generated rather than read are called ``synthetic/NAME``.
 SYNTHETIC = "synthetic/"
-#: How far from the camera objects are, metres, where truth is in metres.
-_TRUE_M = (0.02, 20.0)
 #: Renders those; imported when one is asked for.
 _GENERATOR = "p2p_lib.synthetic"
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectTruth:
-    """One object's truth over the whole sequence.
-
-    T_cam_model  (N, 4, 4) metres, OpenCV axes; NaN where there is none
-    labelled     (N,) bool: the dataset's own visibility labels hold (all True where it has none)
-    """
-
-    T_cam_model: np.ndarray
-    labelled: np.ndarray
-
-    def __post_init__(self) -> None:
-        T, labelled = self.T_cam_model, self.labelled
-        if not (isinstance(T, np.ndarray) and isinstance(labelled, np.ndarray)):
-            got = f"{type(T).__name__} and {type(labelled).__name__}"
-            raise BadInput("truth", got, "arrays (N, 4, 4) and (N,) bool")
-        if T.shape != (len(T), 4, 4) or labelled.shape != (len(T),) or labelled.dtype != bool:
-            got = f"T_cam_model {T.shape}, labelled {labelled.shape} {labelled.dtype}"
-            raise BadInput("truth", got, "(N, 4, 4) and (N,) bool")
 
 
 class Sequence(Protocol):
@@ -187,7 +164,7 @@ def open_sequence(
             raise BadInput(what, type(read).__name__, "an ImageSequence, see CONTRIBUTING.md")
         read.check_camera()
     found = replace(read, name=name, format=format, depth_scale=depth_scale or read.depth_scale, scene_seed=seed)
-    return replace(found, read_truth=partial(_truth, found, found.read_truth))
+    return replace(found, read_truth=partial(_read_truth, found, found.read_truth))
 
 
 @contextmanager
@@ -210,48 +187,11 @@ def _named(format: str) -> Iterator[None]:
         raise BadInput(what, got, "a loader that ends without an error", fix) from error
 
 
-def _truth(sequence: Sequence, read: Callable[[], Any]) -> dict[str, ObjectTruth]:
-    """What a layout's ``read_truth`` gives, of each frame, each pose made rigid.
-
-    Raises :class:`BadInput` for what is none, and warns of poses where nothing can be, or is to be seen.
-    """
+def _read_truth(sequence: Sequence, read: Callable[[], Any]) -> dict[str, ObjectTruth]:
+    """What a layout's ``read_truth`` gives, checked."""
     with _named(sequence.format):
-        given, whose = read(), f"(format {sequence.format})"
-    if not isinstance(given, dict):
-        raise BadInput(f"truth {whose}", f"a value of type {type(given).__name__}", "a dict, object to ObjectTruth")
-    found = {}
-    for name, of in given.items():
-        what, fix = f"truth of {name!r} {whose}", "Poses of frames without truth are NaN."
-        if not isinstance(of, ObjectTruth):
-            raise BadInput(what, f"a value of type {type(of).__name__}", "an ObjectTruth, see CONTRIBUTING.md")
-        if len(of.labelled) != len(sequence):
-            raise BadInput(what, f"{len(of.labelled)} poses", f"{len(sequence)}, one for each image", fix)
-        T, known = np.array(of.T_cam_model, float), np.isfinite(of.T_cam_model).all((1, 2))
-        for i in np.flatnonzero(known):
-            try:
-                se3.check(f"{what}, row {i}", T[i], NOT_RIGID)
-            except BadInput as error:
-                raise advised(error, f"T_cam_model turns and moves, and scales nothing. {fix}") from None
-        T[known] = se3.orthonormalised(T[known])
-        found[name] = ObjectTruth(T, of.labelled)
-        if wrong := _odd(T[known & of.labelled], sequence.camera):
-            doubt(what, *wrong, of=name)
-    return found
-
-
-def _odd(T_cam_model: np.ndarray, camera: Camera) -> tuple[str, str] | None:
-    """What is odd about an object's poses (n, 4, 4) in frames that show it, and what to do; None where nothing is."""
-    at_m = T_cam_model[:, :3, 3]
-    if not len(at_m):
-        return None
-    away_m = float(np.median(np.linalg.norm(at_m, axis=1)))
-    if not _TRUE_M[0] <= away_m <= _TRUE_M[1]:
-        return f"{away_m:.3g} m from the camera (median)", "Is T_cam_model in metres? Millimetres times 0.001 are."
-    outside = ~((at_m[:, 2] > 0) & camera.inside(camera.project(at_m)))
-    if outside.mean() <= 0.5:
-        return None
-    fix = "T_cam_model is from the model to the camera (x right, y down, z forward): is it inverted, or of other axes?"
-    return f"the model's origin is outside the image in {outside.sum()} of {len(outside)} frames", fix
+        given = read()
+    return checked_truth(given, f"(format {sequence.format})", sequence.camera, len(sequence))
 
 
 def no_truth_said(sequence: Sequence) -> str:

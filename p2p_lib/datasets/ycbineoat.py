@@ -17,7 +17,7 @@ import numpy as np
 from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.truth import ObjectTruth
 
 OBJECT = "object"
 YCB_NAMES = {

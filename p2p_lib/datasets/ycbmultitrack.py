@@ -21,7 +21,7 @@ from p2p_lib.core.files import read_array
 from p2p_lib.core.paths import full
 from p2p_lib.datasets import images
 from p2p_lib.datasets.image_sequence import ImageSequence, image_files
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.truth import ObjectTruth
 
 DEPTH_INVALID = 65535
 LABELS = {"is_mask_visible": "is_mask_visible.npy", "is_obj_in_image_labels": "is_obj_in_image.npy"}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -34,11 +33,6 @@ _GONE_FRAMES, _GONE_SHARE, _AWAY_SHARE = 30, 0.1, 0.5
 _CHANCE = 2
 #: Stretches of frames that are named, the worst first.
 _NAMED = 3
-
-
-def contradicted(overlap: Any, on_surface: Any) -> Any:
-    """Whether a silhouette or depth speaks against a pose; what is not known (NaN) does not."""
-    return (overlap < OVERLAP) | (on_surface < ON_SURFACE)
 
 
 @dataclass(frozen=True, eq=False)

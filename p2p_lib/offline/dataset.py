@@ -23,9 +23,9 @@ from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.bop import Outline, write_models, write_scene
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.truth import ObjectTruth
 from p2p_lib.evaluation.evidence import on_surface
-from p2p_lib.evaluation.suspicions import ON_SURFACE, OVERLAP, contradicted
+from p2p_lib.evaluation.suspicions import ON_SURFACE, OVERLAP
 from p2p_lib.offline.finished import RULE, Finished, Renderer, Silhouette, new_folder
 
 #: Depth up to this far before a surface does not hide it, m (the BOP toolkit's).
@@ -81,7 +81,7 @@ def agreement(silhouette: Silhouette, shown: np.ndarray, depth_m: np.ndarray, ma
 
 def doubtful(confidence: float, iou: float, on: float) -> bool:
     """Whether a label is to be looked at, by :data:`DOUBTFUL`; what is not known (NaN) speaks against none."""
-    return bool(confidence <= DOUBTED or contradicted(iou, on))
+    return bool(confidence <= DOUBTED or iou < OVERLAP or on < ON_SURFACE)
 
 
 class _Labels:

@@ -18,7 +18,8 @@ from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.types import Frame
-from p2p_lib.datasets.sequence import ObjectTruth, Sequence
+from p2p_lib.datasets.sequence import Sequence
+from p2p_lib.datasets.truth import ObjectTruth
 
 Masks = dict[str, np.ndarray]
 #: Readings that no depth camera should give.

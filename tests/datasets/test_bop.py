@@ -13,7 +13,8 @@ from p2p_lib.core.errors import BadInput, MissingData
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.bop import write_models, write_scene
 from p2p_lib.datasets.models import find_models, load_points
-from p2p_lib.datasets.sequence import ObjectTruth, open_sequence
+from p2p_lib.datasets.sequence import open_sequence
+from p2p_lib.datasets.truth import ObjectTruth
 
 W, H = 40, 30
 NUMBERS = (1, 36, 37)  # keyframes with gaps

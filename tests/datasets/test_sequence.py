@@ -21,7 +21,8 @@ from p2p_lib.datasets.image_sequence import ImageSequence
 from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.run_writer import RunWriter
 from p2p_lib.datasets.runs import load_run
-from p2p_lib.datasets.sequence import FORMATS, ObjectTruth, open_sequence, reopen
+from p2p_lib.datasets.sequence import FORMATS, open_sequence, reopen
+from p2p_lib.datasets.truth import ObjectTruth
 from p2p_lib.evaluation.protocol import scored_frames
 from p2p_lib.run import run
 

@@ -135,7 +135,7 @@ class Plate:
 
     def __init__(self, crossing, turns_deg, depth_m=None, mask=True, labelled=None):
         from p2p_lib.core import se3
-        from p2p_lib.datasets.sequence import ObjectTruth
+        from p2p_lib.datasets.truth import ObjectTruth
 
         self.camera, self._depth, self._mask = crossing.camera, depth_m, mask
         T = se3.exp(np.array([[0, np.radians(d), 0, 0, 0, 0] for d in turns_deg]))

@@ -8,7 +8,7 @@ import trimesh
 from pandas import DataFrame
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.datasets.sequence import ObjectTruth
+from p2p_lib.datasets.truth import ObjectTruth
 from p2p_lib.figures import style
 from p2p_lib.offline.model import Shape, Textured
 from p2p_lib.synthetic.noise import PERFECT
