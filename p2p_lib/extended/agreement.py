@@ -14,8 +14,9 @@ from p2p_lib.core.types import SPARSE, Frame
 
 #: Pixels that changed by less in each of red, green and blue, in grey levels, look the same.
 _SAME_GREY = 12
-#: So many places have to tell whether the camera stands still, and at least this share of them that it does.
-_TELLING, _STANDS = 30, 0.4
+#: A camera stands still if so much more of the image looks the same than would by chance, of what could; by so many
+#: places at least. By chance: as what was so many places beside it.
+_STANDS, _TELLING, _ASIDE = 0.2, 30, 2
 #: Depth is compared this many px to either side of the outline, at this many places at least; a step is larger, m.
 _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
 
@@ -23,22 +24,26 @@ _BESIDE_PX, _OUTLINE, _DEPTH_STEP_M = 4, 20, 0.02
 def scene_ratio(frame: Frame, mask: np.ndarray, before: Frame, mask_before: np.ndarray) -> float:
     """Median ratio of depths, now over before, of pixels beside the object that look the same; 1 with a moving camera.
 
-    A camera stands still where places that differ from those beside them look the same: of a plain wall all look
-    the same from everywhere. Points that slide over an object, or follow wrong depth, change nothing of it.
+    Points that slide over an object, or follow wrong depth, change nothing of it.
     """
     now, now_m, then, then_m = (of.sparse[name] for of in (frame, before) for name in ("rgb", "depth_m"))
     beside = ~(mask[SPARSE] | mask_before[SPARSE])
-    same, telling = beside & _alike(now, then), beside & _telling(now)
-    if telling.sum() < _TELLING or same[telling].mean() < _STANDS:
+    same = beside & _alike(now, then)
+    if not _stands(now, then, same, beside):
         return 1.0
     same &= (now_m > 0) & (then_m > 0)
     return float(np.median(now_m[same] / then_m[same])) if same.sum() >= _TELLING else 1.0
 
 
-def _telling(rgb: np.ndarray) -> np.ndarray:
-    """(H, W) bool: where an image (H, W, 3) differs from what is beside: of a plain wall all looks the same."""
-    around = np.ones((3, 3), np.uint8)
-    return ~_alike(cv2.dilate(rgb, around), cv2.erode(rgb, around))
+def _stands(now: np.ndarray, then: np.ndarray, same: np.ndarray, beside: np.ndarray) -> bool:
+    """Whether the camera stands still: what looks the ``same`` does so because it is (Cohen's kappa of two images).
+
+    Of a wall, or a table's grain, much looks the same wherever the camera goes, and as much as what is beside it.
+    """
+    aside = (np.roll(then, step, axis) for step in (-_ASIDE, _ASIDE) for axis in (0, 1))
+    by_chance = np.mean([np.count_nonzero(beside & _alike(now, other)) for other in aside])
+    could = np.count_nonzero(beside) - by_chance
+    return bool(could >= _TELLING and np.count_nonzero(same) - by_chance >= _STANDS * could)
 
 
 def _alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -47,6 +47,18 @@ def test_a_camera_that_comes_nearer_measures_no_otherwise(contrast):
     assert scene_ratio(replace(frame, depth_m=0.9 * frame.depth_m), mask, before, mask_before) == 1
 
 
+def test_a_table_whose_grain_looks_alike_from_everywhere_does_not_tell_that_the_camera_stands():
+    """Of two places nine in ten look the same, so that nine in ten do wherever the camera goes."""
+    (before, mask_before), (frame, mask) = table(100), table(100)
+    grain = np.random.default_rng(0).integers(60, 76, (2, 40, 40)).repeat(8, 1).repeat(8, 2)
+    before, moved = (replace(before, rgb=np.repeat(of[..., None], 3, 2).astype(np.uint8)) for of in grain)
+    nearer = replace(moved, depth_m=0.9 * frame.depth_m)
+    assert (np.abs(before.rgb[::8, ::8].astype(int) - moved.rgb[::8, ::8]) < 12).mean() > 0.8
+    assert scene_ratio(nearer, mask, before, mask_before) == 1
+    (cloth, _), still = table(100), replace(nearer, rgb=frame.rgb)
+    assert scene_ratio(still, mask, cloth, mask_before) == pytest.approx(0.9)
+
+
 def test_a_mask_ends_where_depth_has_steps():
     frame, mask = scene(30)
     assert outline_share(frame, mask) == 1
