@@ -61,7 +61,6 @@ MECHANISMS = {
     "rest": "An object left at rest is accepted elsewhere only if enough points agree.",
     "scale": "Nothing is learnt while depth shows the resting scene nearer or farther than before.",
     "outline": "Nothing is learnt while the outline of the mask does not follow depth edges.",
-    "colours": "Nothing is learnt while much of the surface has other colours under the pose of a return.",
     "still": "Nothing is learnt while the camera repeats the same image.",
     # Inside: confidence, graph.
     "confidence": "Each pose gets a confidence, which weights the points that it places.",

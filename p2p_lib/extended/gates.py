@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 from p2p_lib.core.config import LifecycleConfig
 from p2p_lib.core.types import Status
-from p2p_lib.extended.image_search import Sighting
 from p2p_lib.extended.lifecycle import Lifecycle
 from p2p_lib.method.policy import Verdict
 
@@ -42,7 +41,6 @@ class PoseEvidence:
     slides         whether the pose may move along the surface without leaving it, as that of something flat
     rests          whether an object that lay still is where the scene has it; None where nobody knows
     contour        share of its contour that shows where its mask ends; 0 where nobody has looked
-    shown          what of its surface shows under the pose, while its colours are in question; None: not looked for
     """
 
     support: int
@@ -56,7 +54,6 @@ class PoseEvidence:
     slides: bool = False
     rests: bool | None = None
     contour: float = 0.0
-    shown: Sighting | None = None
 
 
 @dataclass(frozen=True)
@@ -133,12 +130,6 @@ def _another_depth(life: Lifecycle, evidence: PoseEvidence) -> str:
     return f"depth shows what rests {ratio:.2f} times as far away as before" if abs(ratio - 1) > _RATIO else ""
 
 
-def _other_colours(life: Lifecycle, evidence: PoseEvidence) -> str:
-    """Sides that look alike, as the lids of a tin, agree on a pose under which what is beside them does not."""
-    unlike = evidence.shown is not None and life.looks_unlike(evidence.shown)
-    return "the surface has other colours under the pose" if unlike else ""
-
-
 def _same_image(life: Lifecycle, evidence: PoseEvidence) -> str:
     return "the camera repeats the same image" if evidence.still else ""
 
@@ -147,7 +138,6 @@ def _same_image(life: Lifecycle, evidence: PoseEvidence) -> str:
 DOUBTS: dict[str, Callable[[Lifecycle, PoseEvidence], str]] = {
     "scale": _another_depth,
     "outline": _mask_off_steps,
-    "colours": _other_colours,
     "still": _same_image,
 }
 

@@ -90,25 +90,18 @@ class Sighting:
     T_cam_obj  (4, 4)
     share      points of the surface that show less those contradicted, over those that should show
     uv_px      (K, 2) where points were found on the surface in their colour
-    measured   points that were found on the surface, in their colour or not; 0 for few, or in another light
     light      how much lighter these are than they were, as a logarithm
     """
 
     T_cam_obj: np.ndarray
     share: float
     uv_px: np.ndarray
-    measured: int = 0
     light: float = 0.0
 
     @property
     def rank(self) -> float:
         """What poses of one frame are compared by."""
         return self.share - max(abs(self.light) - _IN_ITS_LIGHT, 0.0)
-
-    @property
-    def alike(self) -> float:
-        """The share of points found on the surface that have their colour; 1 if there are none."""
-        return len(self.uv_px) / self.measured if self.measured else 1.0
 
 
 def most_shown(found: Iterable[Sighting | None]) -> Sighting | None:
@@ -242,10 +235,10 @@ class ImageSearch:
 
     def at(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> Sighting | None:
         """The evidence of one pose; None where too little of the surface would show."""
-        (share,), (found,), (uv_px,), (measured,), (light,) = self._compare(T_cam_obj[None], sample, _FINE_M)
+        (share,), (found,), (uv_px,), (light,) = self._compare(T_cam_obj[None], sample, _FINE_M)
         if not np.isfinite(share):
             return None
-        return Sighting(T_cam_obj, float(share), uv_px[found], int(measured), float(light))
+        return Sighting(T_cam_obj, float(share), uv_px[found], float(light))
 
     def _aligned(self, T_cam_obj: np.ndarray, sample: SurfaceSample) -> np.ndarray:
         """The pose after robust point-to-plane alignment with the points measured at its pixels."""
@@ -264,11 +257,8 @@ class ImageSearch:
 
     def _compare(
         self, T_cam_obj: np.ndarray, sample: SurfaceSample, near_m: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Shares (H,), -inf where unknown; found (H, M) bool; their pixels (H, M, 2).
-
-        And how many are measured (H,), in which light (H,).
-        """
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Shares (H,), -inf where unknown; found (H, M) bool; their pixels (H, M, 2); in which light (H,)."""
         arrays = np.ascontiguousarray(T_cam_obj), sample.p_obj, sample.n_obj, sample.lab, self._depth_m, self._lab
         return _compare(*arrays, self._lens, self._noise, near_m, _FEWEST * len(sample) / _POINTS)
 
@@ -311,7 +301,7 @@ def _normal_equations(T, p_obj, n_obj, depth_m, lens):
 def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, fewest):
     poses, points = len(T_cam_obj), len(p_obj)
     (height, width), (fx, fy, cx, cy) = depth_m.shape, lens
-    share, measured_on, found = np.full(poses, -np.inf), np.zeros(poses, np.int64), np.zeros((poses, points), np.bool_)
+    share, found = np.full(poses, -np.inf), np.zeros((poses, points), np.bool_)
     uv_px, lighter = np.full((poses, points, 2), np.nan), np.zeros(points)  # how much lighter, by its logarithm
     light = np.zeros(poses)
     for h in range(poses):
@@ -359,11 +349,9 @@ def _compare(T_cam_obj, p_obj, n_obj, lab, depth_m, seen, lens, noise, near_m, f
         if abs(light[h]) > _EXPOSED:
             agree = 0
             found[h] = False
-        elif on >= fewest:
-            measured_on[h] = on
         if shown >= fewest and shown >= _SHOWN * facing:
             share[h] = (agree - behind) / max(shown + _HIDDEN * hidden, 1.0)
-    return share, found, uv_px, measured_on, light
+    return share, found, uv_px, light
 
 
 def _strayed(T_cam_obj: np.ndarray, proposed: np.ndarray | None, sample: SurfaceSample) -> np.ndarray:

@@ -17,7 +17,6 @@ from p2p_lib.method.object_model import CONFIRM_FRAMES, CONFIRM_LONGER, Life
 
 if TYPE_CHECKING:
     from p2p_lib.extended.gates import Judgement
-    from p2p_lib.extended.image_search import Sighting
 
 #: A time between two frames is a pause if it is longer than this, s, and than so many times the one before.
 _PAUSE_S, _PAUSE = 0.25, 5
@@ -28,9 +27,6 @@ _CONFIDENT = 0.5
 _RESTED, _NEAR_M = 3, 0.08
 #: With the first lead shape and colour tell a turn from all others, with the second beyond doubt.
 TELLING, CLEAR = 0.25, 0.5
-#: A return is doubted if less than the first share of the surface measured under its pose has its colours, until the
-#: second has, of at least this share of the points that had been measured: what contradicts it may be hidden.
-_UNLIKE, _ALIKE, _AS_MANY = 0.75, 0.85, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +43,6 @@ class Lifecycle(Life):
     motion          how it moves, by the confident poses; None before the first
     start_px        pixels of the newest mask, in a frame without a pose; None without a mask
     doubted         whether, since a gap, its turn has not been told from others that look alike
-    unlike          most points measured on its surface while that has other colours under its pose; 0 if it has its own
     lost_frames     frames in view since the newest proven pose
     doubted_frames  newest frames in a row whose pose was doubted by one of :data:`~p2p_lib.extended.gates.DOUBTS`
     seen_m2         the most that a keyframe showed of it, across the line of sight
@@ -63,7 +58,6 @@ class Lifecycle(Life):
     motion: Motion | None = None
     start_px: int | None = None
     doubted: bool = False
-    unlike: int = 0
     lost_frames: int = 0
     doubted_frames: int = 0
     in_sight: bool = False
@@ -142,24 +136,14 @@ class Lifecycle(Life):
         lies = None if lies is None or self.T_cam_obj is None else lies @ se3.inverse(self.T_cam_obj) @ T_cam_obj
         return replace(self, T_cam_obj=T_cam_obj, T_world_obj=lies)
 
-    def looks_unlike(self, shown: Sighting) -> bool:
-        """Whether the surface has other colours under a pose, by what of it shows."""
-        if self.unlike:
-            return shown.alike < _ALIKE or shown.measured < _AS_MANY * self.unlike
-        return shown.alike < _UNLIKE
-
     def with_verdict(
         self,
         T_cam_obj: np.ndarray,
         time_s: float,
         verdict: Judgement,
         lead: float | None = None,
-        shown: Sighting | None = None,
     ) -> Lifecycle:
-        """The state after a frame with an accepted pose, its lead over other turns and what of the surface shows."""
-        unlike = self.unlike
-        if shown is not None:
-            unlike = max(unlike, shown.measured) if self.looks_unlike(shown) else 0
+        """The state after a frame with an accepted pose, and its lead over other turns."""
         clear = verdict.status is not Status.DEGRADED or (lead is not None and lead >= CLEAR)
         longest = CONFIRM_FRAMES if clear else CONFIRM_LONGER
         return replace(
@@ -173,7 +157,6 @@ class Lifecycle(Life):
             in_sight=True,
             doubted_frames=self.doubted_frames + 1 if verdict.doubted else 0,
             doubted=self.doubted if lead is None else lead < TELLING,
-            unlike=unlike,
             T_previous=self.T_cam_obj if self.has_pose else None,
             T_left=self.T_left if self.has_pose else self.T_cam_obj,
             confirming=min(max(self.confirming - verdict.proven, 0), longest) if self.has_pose else longest,
@@ -191,7 +174,6 @@ class Lifecycle(Life):
         return replace(
             self,
             status=status,
-            unlike=0,
             lost_frames=lost_frames,
             start_px=mask_px,
             in_sight=in_sight,

@@ -20,7 +20,7 @@ from p2p_lib.extended.confidence import Belief, may_slide
 from p2p_lib.extended.contour import ContourFit, on_plane
 from p2p_lib.extended.gates import FIXED_BY, SIGHTED, Judgement, PoseEvidence, judge
 from p2p_lib.extended.graph import explained
-from p2p_lib.extended.image_search import Sighting, centred_on_cloud
+from p2p_lib.extended.image_search import centred_on_cloud
 from p2p_lib.extended.lifecycle import TELLING, Lifecycle, same_place
 from p2p_lib.extended.model import OurKnown
 from p2p_lib.extended.motion import motion_weight
@@ -53,12 +53,10 @@ class Proposal(Candidate):
     """A hypothesis with what shape and colour say of it.
 
     sighting  share of the surface that shows under its pose; None: not looked for
-    shown     what of the surface shows under its pose, while its colours are in question; None: not looked for
     lead      how much more shows than under the best other turn, as a share; None: not compared
     """
 
     sighting: float | None = None
-    shown: Sighting | None = None
     lead: float | None = None
 
     @property
@@ -66,7 +64,7 @@ class Proposal(Candidate):
         """What speaks for it."""
         assert self.refined is not None, "a pose is judged once it is refined"
         share = self.refined.inliers if self.refined.refined else None
-        return PoseEvidence(self.hypothesis.support, share, self.sighting, self.lead, shown=self.shown)
+        return PoseEvidence(self.hypothesis.support, share, self.sighting, self.lead)
 
     def agreement(self, keypoints: np.ndarray) -> float:
         """Of the keypoints seen (N,) bool, the share that agrees less the share that does not."""
@@ -236,17 +234,11 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         return np.array([vote[c.hypothesis.inliers].mean() if c.hypothesis.support else 0.0 for c in candidates])
 
     def _look_again(self, obs: OurObservation, known: OurKnown, candidates: list[Proposal]) -> list[Proposal]:
-        """Candidates for a return, with how much of the surface shows in the image under each.
-
-        Where points hold the pose, also in its colours: they may be on a side that looks alike.
-        """
-        life = known.life
-        if not ((life.unconfirmed or life.unlike) and self.shape.knows(known)):
+        """Candidates for a return, with how much of the surface shows in the image under each."""
+        if not (known.life.unconfirmed and self.shape.knows(known)):
             return candidates
         found = self.shape.at(obs, known, [c.T_cam_obj for c in candidates])
-        share = [None if s is None or not life.unconfirmed else s.share for s in found]
-        held = [s if c.hypothesis.support >= FIXED_BY else None for c, s in zip(candidates, found, strict=True)]
-        return [replace(c, sighting=s, shown=at) for c, s, at in zip(candidates, share, held, strict=True)]
+        return [replace(c, sighting=None if s is None else s.share) for c, s in zip(candidates, found, strict=True)]
 
     def _told_from_turns(self, obs: OurObservation, known: OurKnown, best: Proposal) -> Proposal:
         """The pose of a return with its lead over the best other turn, or that turn if much more of the surface shows.
@@ -320,8 +312,7 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         """Nothing is learnt from a doubted pose, and one of little confidence makes no keyframe."""
         assert isinstance(best, Proposal) and isinstance(verdict, Judgement)
         belief = Belief.of(obs, best, known, self, "texture" in self.on) if "confidence" in self.on else None
-        shown = best.shown if "colours" in self.on else None
-        life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead, shown)
+        life = known.life.with_verdict(best.T_cam_obj, obs.frame.time_s, verdict, best.lead)
         most = DOUBTED if verdict.doubted or life.doubted else 1.0
         kept: dict[str, Any] = {"life": life, "T_cam_obj": best.T_cam_obj, "belief": belief, "most": most}
         kept |= {"learns": not verdict.doubted, "in_camera": "moving_points" in self.on}

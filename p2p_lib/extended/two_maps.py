@@ -47,11 +47,9 @@ class Relation:
     """Where the other map's object frame lies in this one's, by the newest frames that fit both maps and agree.
 
     T_obj_other  (K, 4, 4), one of each such frame
-    doubted      frames in which the other map has a pose, but a doubted one
     """
 
     T_obj_other: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    doubted: int = 0
 
     def with_frame(self, T_obj_other: np.ndarray, p_other: np.ndarray) -> Relation:
         """With one more frame's (4, 4); one that disagrees with the last, at the points p_other, starts anew."""
@@ -64,8 +62,8 @@ class Relation:
 
     @property
     def certain(self) -> bool:
-        """Whether enough frames agree, and as many as speak against it."""
-        return len(self.T_obj_other) >= max(_FRAMES, self.doubted)
+        """Whether enough frames agree."""
+        return len(self.T_obj_other) >= _FRAMES
 
     @property
     def mean(self) -> np.ndarray:
@@ -281,9 +279,6 @@ class TwoMaps:
         other = self.other
         known = None if other is None or obs.other is None else self._known_again(obs.other, other.known)
         if known is None:
-            return None
-        if known[1].doubted:
-            self._relation = replace(self._relation, doubted=self._relation.doubted + (not obs.still))
             return None
         if best is None or not verdict.accepted:
             return self._accept(self._exchanged(obs), *known)

@@ -74,17 +74,6 @@ def test_what_is_alike_all_along_stays_where_it_is_expected():
     assert found.share > 0.7 and abs((found.T_cam_obj - PLACE)[0, 3]) < 0.01
 
 
-def test_what_is_measured_on_the_surface_has_its_colours_or_others():
-    sample, mixed = sample_of_the_ball(), sample_of_the_ball((150, 100, 90))
-    left = sample.p_obj[:, 0] < 0
-    mixed.lab[left] = sample.lab[left]
-    for paint, alike in ((sample, 1.0), (mixed, 0.5)):
-        found = search(ball_in_front_of_a_wall()).at(PLACE, paint)
-        assert found.measured > 90 and abs(found.alike - alike) < 0.05
-    too_light = search(ball_in_front_of_a_wall((200, 200, 200))).at(PLACE, sample_of_the_ball((30, 30, 30)))
-    assert too_light.measured == 0 and too_light.alike == 1, "in another light nothing is said of colours"
-
-
 def test_exposure_may_have_changed_colour_not():
     sample = sample_of_the_ball()
     assert search(ball_in_front_of_a_wall(gain=0.5)).at(PLACE, sample).share > 0.9

@@ -17,7 +17,7 @@ from p2p_lib.core.stopwatch import Stopwatch
 from p2p_lib.core.types import Frame, Status, Tracks
 from p2p_lib.extended.confidence import Belief
 from p2p_lib.extended.default import chosen, object_tracker
-from p2p_lib.extended.image_search import ImageSearch, Sighting
+from p2p_lib.extended.image_search import ImageSearch
 from p2p_lib.extended.observation import area_m2, expected_px
 from p2p_lib.extended.outlook import Outlook
 from p2p_lib.extended.policy import OurPolicy, Proposal
@@ -924,40 +924,6 @@ def test_a_known_object_that_stays_lost_in_plain_view_begins_a_second_map_and_bo
     query = se3.transform(se3.inverse(back.estimate.T_cam_obj), lump.observed(about(152)).cloud)
     distance_m, valid = model.surface.query(query)
     assert valid.mean() > 0.9 and np.median(np.abs(distance_m[valid])) < 0.002
-
-
-def painted(alike: float, measured: int = 200):
-    """What :meth:`ImageSearch.at` says where so much of the surface has its colours."""
-    return lambda _, T, __: Sighting(T, alike, np.zeros((round(alike * measured), 2)), measured)
-
-
-def test_maps_that_fit_but_for_the_colours_are_not_joined(monkeypatch):
-    """As the two lids of a tin, that are alike: what is beside them is not."""
-    lump, old, _ = turned_over()
-    monkeypatch.setattr(ImageSearch, "at", painted(0.6))
-    for deg in range(153, 410, 4):
-        gone = (hide(lambda tracks: np.isin(tracks.ids, old)),) if deg < 250 else ()
-        assert lump.see(about(deg), *gone).estimate.joined is None
-    assert lump.tracker.other is not None and lump.tracker._relation.doubted > 5
-
-
-def test_a_return_whose_surface_has_other_colours_is_doubted_until_as_much_of_it_shows_in_its_own(monkeypatch):
-    nobody = np.zeros((CAMERA.height, CAMERA.width), bool)
-    for mechanisms, doubted in (("all", True), ("all but colours", False)):
-        lump = settled(begun(method__mechanisms=mechanisms), [2, 4])
-        lump.see(turned(4), mask=nobody)
-        monkeypatch.setattr(ImageSearch, "at", painted(0.7))
-        alone = lump.see(turned(4), unseen).estimate
-        assert alone.T_cam_obj is not None and "0 points agree" in alone.reason, "that is doubt enough"
-        steps = [lump.see(turned(4)).estimate for _ in range(12)]
-        assert {step.status is Status.DEGRADED for step in steps} == {doubted}
-        assert not doubted or all("other colours" in s.reason and s.confidence <= 0.5 and not s.keyframe for s in steps)
-        for alike, measured in ((0.8, 200), (0.9, 150), (0.9, 190)):
-            monkeypatch.setattr(ImageSearch, "at", painted(alike, measured))
-            step = lump.see(turned(4)).estimate
-            assert ("other colours" in step.reason) == (doubted and (alike < 0.85 or measured < 180))
-        monkeypatch.setattr(ImageSearch, "at", painted(0.6))
-        assert "other colours" not in lump.see(turned(4)).estimate.reason, "a followed object is not asked"
 
 
 @pytest.mark.parametrize(("sure", "views", "room"), [(False, 1, True), (False, 2, False), (True, 1, False)])

@@ -34,8 +34,6 @@ def test_a_relation_needs_frames_that_say_it_alike_and_begins_anew_where_they_do
     deg, mm = se3.error_deg_mm(relation.mean, T_FIRST_SECOND)
     each_deg, each_mm = se3.error_deg_mm(noisy, T_FIRST_SECOND)
     assert deg < each_deg.max() and mm < each_mm.max()
-    doubted = replace(relation, doubted=6)
-    assert not doubted.certain and doubted.with_frame(noisy[0], p).certain, "as many frames say it as speak against it"
     for off in ([0, np.radians(8), 0, 0, 0, 0], [0, 0, 0, 0.015, 0, 0]):
         other = T_FIRST_SECOND @ se3.exp(np.array(off))
         assert not relation.with_frame(other, p).certain
