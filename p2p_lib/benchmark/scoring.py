@@ -120,7 +120,7 @@ def _surface(done: Run, name: str) -> trimesh.Trimesh | None:
 
 def _true_model(done: Run, sequence: Sequence, models: Models, name: str) -> Path | np.ndarray:
     """The mesh of an object where one is known, else the points of its model."""
-    folder = Path(done.info.get("path") or ".")
+    folder = sequence.path or Path()
     made_with = {name: folder / where for name, where in (done.info.get("models") or {}).items()}
     made_with = {name: path for name, path in made_with.items() if path.is_file()}
     known = find_models(sequence, MESHES) | made_with | given_models(models, sequence.objects, MESHES)

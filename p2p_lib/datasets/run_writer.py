@@ -16,7 +16,6 @@ from p2p_lib.core.config import Config
 from p2p_lib.core.errors import BadInput, listed
 from p2p_lib.core.files import append, file_name, read_text, replace_text, save_arrays, writing_alone
 from p2p_lib.core.options import differing
-from p2p_lib.core.paths import full, seen_from
 from p2p_lib.core.types import Frame, PoseEstimate, Status
 from p2p_lib.datasets.first_masks import FILE as FIRST_MASKS
 from p2p_lib.datasets.images import save_png
@@ -24,8 +23,9 @@ from p2p_lib.datasets.keypoint_log import FILE as KEYPOINTS
 from p2p_lib.datasets.mask_log import FILE as MASK_LOG
 from p2p_lib.datasets.models import load_points
 from p2p_lib.datasets.provenance import provenance
+from p2p_lib.datasets.run_paths import written_paths
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, NOT_FOLLOWED, OFFLINE, ObjectRun, Run, load_run, read_info, tum_line
-from p2p_lib.datasets.sequence import SYNTHETIC, Sequence, check_images, first_image
+from p2p_lib.datasets.sequence import Sequence, check_images, first_image
 
 IfExists = Literal["refuse", "replace", "resume"]
 _ANEW = "--force, in Python if_exists='replace'"
@@ -89,13 +89,11 @@ class RunWriter:
         self.earlier, self.complete, self.begun = "", False, False
         self.resumed: Run | None = None
         self._held = ExitStack()
-        # A whole path: the run is read from other folders, where a relative one may be another video's.
-        path = None if sequence.name.startswith(SYNTHETIC) or sequence.path is None else full(sequence.path)
+        paths = written_paths(out, sequence, models)
         self.info: dict[str, Any] = {
             "sequence": sequence.name,
-            "path": None if path is None else str(path),
-            "path_from_run": None if path is None else seen_from(out, path),
-            "first_image": first_image(sequence, start) if path is not None else None,
+            **paths,
+            "first_image": first_image(sequence, start) if paths["path"] else None,
             "format": sequence.format,
             "camera": asdict(sequence.camera),
             "objects": list(self._estimates),
@@ -106,7 +104,6 @@ class RunWriter:
             "preset": config.preset,
             "seed": config.seed,
             "scene_seed": getattr(sequence, "scene_seed", None),
-            "models": {name: str(_from(sequence.path, file)) for name, file in models.items()},
             "frames": 0,
             "finished": False,
             "stopped_by": None,
@@ -390,12 +387,6 @@ def _items_alone(key: str, mine: Any, theirs: Any) -> str:
 
 def _not_yet(name: str, frame_index: int, time_s: float) -> PoseEstimate:
     return PoseEstimate(name, frame_index, time_s, Status.INITIALISING, reason=NOT_FOLLOWED)
-
-
-def _from(folder: Path | None, path: Path) -> Path:
-    """The path as seen from the folder where it lies in there, else the whole path."""
-    path, inside = full(path), folder and full(folder)
-    return path.relative_to(inside) if inside is not None and path.is_relative_to(inside) else path
 
 
 def _clear(out: Path, info: Mapping[str, Any]) -> None:

@@ -33,10 +33,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from p2p_lib.core import se3
 from p2p_lib.core.errors import DEPTH_MOVED, BadInput, Doubt, MissingData
 from p2p_lib.core.files import file_name, load_arrays, read_text
-from p2p_lib.core.options import located
-from p2p_lib.core.paths import full
 from p2p_lib.core.types import DOUBTED, PoseEstimate, Status
 from p2p_lib.datasets.masks import read_labels
+from p2p_lib.datasets.run_paths import read_paths
 from p2p_lib.datasets.schema import read_json
 from p2p_lib.datasets.sequence import Sequence
 
@@ -297,23 +296,12 @@ def load_run(folder: str | Path, every_map: bool = False) -> Run:
 
 
 def read_info(folder: Path) -> dict[str, Any] | None:
-    """What ``run.json`` says; None where there is none, :class:`BadInput` where it is not a run's.
-
-    Relative paths, which earlier versions wrote, are as seen from the current folder. A sequence that is not where it
-    was any more is looked for where it was as seen from the run.
-    """
+    """What ``run.json`` says; None where there is none, :class:`BadInput` where it is not a run's."""
     path = folder / "run.json"
     if not path.exists():
         return None
     info = read_json(path, _Info, "what p2p run wrote").model_dump(exclude_unset=True)
-    at = info["path"] and full(info["path"])
-    if at and not at.exists() and (moved := folder / (info.get("path_from_run") or at)).exists():
-        at = full(moved)
-    info["path"] = at and str(at)
-    info["models"] = {
-        name: file if (at and (at / file).is_file()) else str(full(file)) for name, file in info["models"].items()
-    }
-    return info | ({"options": located(info["options"], at)} if info.get("options") else {})
+    return info | read_paths(folder, info)
 
 
 def _load_timings(path: Path) -> dict[str, np.ndarray]:

@@ -33,11 +33,11 @@ from p2p_lib.core.config import Config, from_toml
 from p2p_lib.core.errors import MissingData, listed
 from p2p_lib.core.files import load_arrays, replace_text, save_arrays, writing_alone
 from p2p_lib.core.mesh import save
-from p2p_lib.core.paths import seen_from
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, WITH_POSE, Status, evenly
 from p2p_lib.datasets.keypoint_log import load_keypoints
 from p2p_lib.datasets.provenance import code_digest
+from p2p_lib.datasets.run_paths import written_path
 from p2p_lib.datasets.runs import COLUMNS, NO_POSE, OFFLINE, ObjectRun, read_info, tum_line
 from p2p_lib.evaluation.suspicions import ON_SURFACE
 from p2p_lib.offline import OFFLINE_COMMENT
@@ -253,8 +253,7 @@ def _write(made: Finished, parts: Path, stamp: dict[str, str]) -> list[str]:
         shutil.copytree(parts / "meshes", new / "meshes")
     there = made.run.path / OFFLINE
     about = {"offline": True, **stamp, "masks_in": "..", "disagrees_above_3_sigma": disagrees}
-    if made.run.info["path"]:
-        about["path_from_run"] = seen_from(there, made.run.info["path"])
+    about |= written_path(there, made.run.info["path"])
     replace_text(new / "run.json", json.dumps(made.run.info | about, indent=1, ensure_ascii=False) + "\n")
     if there.exists():
         shutil.rmtree(parts / "before", ignore_errors=True)

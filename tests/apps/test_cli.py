@@ -23,8 +23,9 @@ from p2p_lib.apps.click import Clicker
 from p2p_lib.core.errors import MissingData, P2PError
 from p2p_lib.core.options import RunOptions
 from p2p_lib.core.prompts import Prompt
+from p2p_lib.datasets.models import find_models
 from p2p_lib.datasets.prompts import save_prompts
-from p2p_lib.datasets.runs import load_run
+from p2p_lib.datasets.runs import load_run, read_info
 from p2p_lib.datasets.sequence import open_sequence
 from p2p_lib.extended.default import Point2Pose
 from p2p_lib.run import summary
@@ -367,6 +368,32 @@ def test_a_run_is_of_its_own_video_from_wherever_it_is_read(sequence, tmp_path, 
     assert run(Path("slide"), Path("out"), *words, "--resume") == 0 and "which is finished" in capsys.readouterr().err
     shutil.copy(here / "slide/rgb" / image.name, there / "slide/rgb")
     assert run(Path("slide"), Path("out"), *words, "--resume") == 2 and "images of frame 0" in one_line(capsys)
+
+
+def test_a_run_of_a_bundled_scene_goes_on_from_any_folder(tmp_path, capsys, monkeypatch):
+    """Its models are where it is rendered to, which is no business of the current folder; one's own are whole."""
+    step, out, words = Point2Pose.step, tmp_path / "out", ["--stop", "4"]
+    model = find_models(open_sequence("synthetic/crossing"))["can"]
+    own = shutil.copy(model, tmp_path / "own.xyz")
+
+    def interrupted(self, frame, masks=None):
+        if frame.index == 2:
+            raise KeyboardInterrupt
+        return step(self, frame, masks)
+
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Point2Pose, "step", interrupted)
+        assert run("synthetic/crossing", out, "--models", "can=own.xyz", *words) == 130
+    for there in ("here", "elsewhere"):
+        (tmp_path / there).mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert cli.main(["run", "--resume", "--out", "../out", "--quiet"]) == 0
+    info = read_info(out)
+    assert info["models"] == {"box": "models/box/points.xyz", "can": str(own)} and info["frames"] == 4
+    monkeypatch.chdir(tmp_path / "here")
+    assert cli.main(["run", "--resume", "--from", "3", "--out", "../out", "--quiet"]) == 0
+    assert read_info(out) == info and "which is finished" not in capsys.readouterr().err
 
 
 def test_a_run_that_was_moved_with_its_video_still_finds_it(sequence, tmp_path, monkeypatch, capsys):
