@@ -2,7 +2,7 @@
 
 import pytest
 
-from p2p_lib.apps.readiness import present_plans, readiness, what_to_fetch
+from p2p_lib.apps.readiness import overview, present_plans, readiness, what_to_fetch
 from p2p_lib.benchmark import load_benchmark
 from tests.fixtures.sliding_board import write_sequence
 
@@ -56,8 +56,10 @@ def test_what_is_missing_names_sequences_frames_size_and_command(nothing, tmp_pa
 def test_what_is_there_and_only_not_run_yet_is_not_missing(nothing, tmp_path, monkeypatch):
     monkeypatch.setenv("P2P_DATA", str(tmp_path))
     write_sequence(tmp_path / "YCBInEOAT/mustard0", 6, 2, seed=2)
-    (line,) = what_to_fetch(load_benchmark("ycbineoat", tmp_path / "out"))
+    line, cut = what_to_fetch(load_benchmark("ycbineoat", tmp_path / "out"))
     assert "ycbineoat/mustard_easy_00_02" in line and "mustard0" not in line
+    assert cut == "ycbineoat/mustard0: 6 of its 737 frames are here, and its rows are of these"
+    assert cut in list(overview()) and readiness("ycbineoat").endswith(f"\n  {cut}")
 
 
 def test_plans_whose_data_is_there_are_found(nothing, tmp_path, monkeypatch):
