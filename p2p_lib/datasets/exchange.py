@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from p2p_lib.core import se3
-from p2p_lib.core.errors import BadInput, MissingData, did_you_mean, doubt
+from p2p_lib.core.errors import BadInput, MissingData, did_you_mean, doubt, listed
 from p2p_lib.core.files import check_new, read_text, replace_text
 from p2p_lib.core.types import PoseEstimate, Status
 from p2p_lib.datasets import images
@@ -263,6 +263,7 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
     name_of = {number: name for name, number in reversed(_obj_ids(sequence.objects).items())}
     poses: dict[str, np.ndarray] = {}
     best: dict[tuple[str, int], float] = {}
+    others: dict[int, set[int]] = {}  # the objects of each scene of which nothing is read
     for number, row in enumerate(_bop_rows(path), 2):
         where = f"{path}: line {number}"
         try:
@@ -273,7 +274,8 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
         except (KeyError, ValueError, TypeError, AttributeError) as error:
             raise BadInput(where, f"unreadable ({error})", BOP_HEADER) from None
         if scene != _scene_id(sequence) or obj not in name_of:
-            continue  # another scene's, or an object that this one does not have
+            others.setdefault(scene, set()).add(obj)  # another scene's, or an object that this one does not have
+            continue
         if image not in frame_of:
             raise BadInput(where, f"im_id {image}", "the number of an image of the sequence")
         name, frame = name_of[obj], frame_of[image]
@@ -282,7 +284,11 @@ def _read_bop(path: Path, sequence: Sequence) -> dict[str, np.ndarray]:
             poses.setdefault(name, np.full((len(sequence), 4, 4), np.nan))
             poses[name][frame] = se3.orthonormalised(se3.check(where, T, images.NOT_RIGID))
     if not poses:
-        raise BadInput(str(path), f"nothing of scene {_scene_id(sequence)}", f"poses of {', '.join(sequence.objects)}")
+        there = [f"scene_id {scene} with obj_id {listed(sorted(objs), _NAMED)}" for scene, objs in others.items()]
+        got = f"nothing of scene {_scene_id(sequence)}{', but ' * bool(there)}{listed(there, _NAMED)}"
+        wanted = ", ".join(f"{name} is {number}" for name, number in _obj_ids(sequence.objects).items())
+        fix = f"Write scene_id {_scene_id(sequence)}, and the obj_id of each object."
+        raise BadInput(str(path), got, f"scene_id {_scene_id(sequence)}, obj_id of its objects: {wanted}", fix)
     return poses
 
 

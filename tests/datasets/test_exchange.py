@@ -354,11 +354,20 @@ def test_only_some_frames(table, tmp_path):
 
 
 IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n"
+ROW = "1 0 0 0 1 0 0 0 1,0 0 500"
 FAULTS = {
     "no such folder": ({}, r"theirs: no such file or folder, expected poses"),
     "two tables": ({"a.csv": "", "b.csv": ""}, r"theirs: got 2 \.csv files"),
     "another header": ({"a.csv": "a,b\n1,2\n"}, r"a\.csv: got the header 'a,b', expected scene_id"),
-    "nothing of it": ({"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n"}, r"a\.csv: got nothing of scene 1"),
+    "nothing of it": (
+        {"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n1,0,7,1,,,1\n3,0,1,1,,,1\n".replace(",,", f",{ROW},")},
+        r"a\.csv: got nothing of scene 1, but scene_id 1 with obj_id 7, scene_id 3 with obj_id 1, "
+        r"expected scene_id 1, obj_id of its objects: .*can is \d.*Write scene_id 1, and the obj_id of each object",
+    ),
+    "nothing at all": (
+        {"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n"},
+        r"a\.csv: got nothing of scene 1, expected",
+    ),
     "a short rotation": (
         {"a.csv": "scene_id,im_id,obj_id,score,R,t,time\n1,0,1,1,1 0 0,0 0 1,1\n"},
         r"a\.csv: line 2: got unreadable",
