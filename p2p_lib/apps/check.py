@@ -38,12 +38,14 @@ from p2p_lib.datasets.depth_units import (
     distance_m,
     hardly_counts,
     likely_units,
+    near_scene,
     odd_scene,
     odd_size,
     uncounted,
 )
 from p2p_lib.datasets.image_sequence import INTRINSICS, paired_images, read_K
 from p2p_lib.datasets.images import DEFAULT_HZ
+from p2p_lib.datasets.numbering import numbered_apart
 from p2p_lib.datasets.sequence import Sequence, no_truth_said, open_sequence, recognise
 from p2p_lib.evaluation.known_size import Lengths
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX
@@ -133,9 +135,9 @@ def check_folder(
     sized = [_size(name, m, *firsts[name], sequence.camera) for name, m in sizes_m.items() if name in firsts]
     depth, unit = _depth(frames, scale), None
     if depth.level is not Level.WRONG:
-        unit = _beyond(firsts, sized, config, scale) if firsts else _uncounted(depth, frames, config, scale)
-    in_doubt = [unit] if unit is not None else []
-    about_depth = [depth, *in_doubt] if firsts else in_doubt or [depth]
+        unit = _beyond(firsts, sized, config, scale) or _uncounted(depth, frames, firsts, sized, config, scale)
+    of_objects = unit is not None and unit.name != depth.name
+    about_depth = [depth, unit] if unit is not None and of_objects else [unit or depth]
     findings += [_times(sequence), _repeated(pairs), *about_depth, _scale(pairs)]
     if about_depth[-1].level is Level.WRONG:
         return findings  # what follows would only be its consequences
@@ -151,7 +153,7 @@ def check_folder(
         elif wrong_size := odd_size(mask, distance_m(frame, mask), sequence.camera, scale):
             findings.append(Finding(f"{name}: size", Level.LOOK, *wrong_size))
         others = [(f, m[name]) for f, m in zip(frames, masks) if name in m and not prompts]
-        if unit is None or np.isnan(distance_m(frame, mask)):
+        if not of_objects or np.isnan(distance_m(frame, mask)):
             findings.append(_range(name, frame, mask, config, scale))
         said = [of.message for of in doubts if isinstance(of.message, Doubt) and of.message.object == name]
         findings += [Finding(f"{name}: clicks", Level.LOOK, str(doubt)) for doubt in said]
@@ -226,13 +228,15 @@ def _whole(sequence: Sequence) -> tuple[np.ndarray, list[Finding]]:
     rgb, depth = getattr(sequence, "rgb", ()), getattr(sequence, "depth", ())
     missing = [path for path in depth if not path.is_file()]
     torn = [path for path in (*rgb, *depth) if path.is_file() and images.is_cut_off(path)]
-    found = [(missing, f"{len(missing)} of {len(depth)} depth images are missing", "Put them back.")] * bool(missing)
-    found += [(torn, f"{len(torn)} of {len(rgb) + len(depth)} images end too early", "Copy them again.")] * bool(torn)
+    apart = numbered_apart([path for path in depth if path not in missing], rgb) if missing else ""
+    back = f"Put them back. {images.SKIP_BAD}{' Or none is, and both are counted apart: ' * bool(apart)}{apart}"
+    found = [(missing, f"{len(missing)} of {len(depth)} depth images are missing", back)] * bool(missing)
+    again = f"Copy them again. {images.SKIP_BAD}"
+    found += [(torn, f"{len(torn)} of {len(rgb) + len(depth)} images end too early", again)] * bool(torn)
     lost = {*missing, *torn}
     whole = [i for i in range(len(sequence)) if not lost or not lost & {rgb[i], depth[i]}]
     return np.array(whole, int), [
-        Finding("files", Level.WRONG, f"{what}: {listed(paths, _LISTED)}", f"{fix} {images.SKIP_BAD}")
-        for paths, what, fix in found
+        Finding("files", Level.WRONG, f"{what}: {listed(paths, _LISTED)}", fix) for paths, what, fix in found
     ]
 
 
@@ -378,12 +382,18 @@ def _depth(frames: list[Frame], scale: float) -> Finding:
     return Finding("depth", Level.OK, text)
 
 
-def _uncounted(depth: Finding, frames: list[Frame], config: Config, scale: float) -> Finding | None:
+def _uncounted(
+    depth: Finding, frames: list[Frame], firsts: FirstMasks, sizes: Iterable[Finding], config: Config, scale: float
+) -> Finding | None:
     """The finding on depth of which hardly any counts, or whose near part is nowhere near: all that tells a unit here.
 
-    Of masks, what they hold tells more.
+    Of masks, what they hold tells more, and a size that fits everything: beside them only a scene that is near as a
+    whole is doubted.
     """
-    wrong = hardly_counts(frames, config.depth, scale) or odd_scene(frames, scale)
+    if firsts:
+        wrong = None if any(of.fine for of in sizes) else near_scene(frames, scale)
+    else:
+        wrong = hardly_counts(frames, config.depth, scale) or odd_scene(frames, scale)
     return None if wrong is None else replace(depth, level=Level.LOOK, text=f"{depth.text}, {wrong[0]}", fix=wrong[1])
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -13,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from p2p_lib.core.camera import Camera
-from p2p_lib.core.errors import BadInput, MissingData, advised
+from p2p_lib.core.errors import BadInput, P2PError, advised, listed
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets import images
 from p2p_lib.datasets.masks import MaskFiles, find_masks
@@ -27,6 +29,10 @@ WRITE_K = (
     "Write fx 0 cx / 0 fy cy / 0 0 1 into cam_K.txt, in pixels at the size of the images, as the camera's driver gives "
     "them; without it camera_intrinsic.json of Open3D's recorder is read."
 )
+#: Files in which somebody may have put it instead, and those that hold something else.
+_TEXTS, _NO_K = (".txt", ".json", ".yaml", ".yml", ".csv"), ("times.txt", "depth_scale.txt")
+#: What the name of such a file has where its numbers cannot be told from others.
+_LIKELY = "intrin|calib|cam|^k[.]"
 #: What Open3D's recorders call theirs.
 INTRINSICS = ("camera_intrinsic.json", "intrinsic.json")
 
@@ -117,8 +123,8 @@ class ImageSequence:
         self._check_index(i)
         rgb = images.read_rgb(self.rgb[i])
         images.check_size(self.rgb[i], rgb, self.shape, "the first image")
-        raw, fix = self.read_depth(self.depth[i]), "Register the depth to the colour camera first."
-        images.check_size(self.depth[i], raw, self.shape, fix=fix)
+        raw = self.read_depth(self.depth[i])
+        images.check_size(self.depth[i], raw, self.shape, fix=_made_to_fit(raw.shape, self.shape))
         depth_m = raw.astype(np.float32) * np.float32(self.depth_scale)
         depth_m[raw == self.depth_invalid] = 0
         return Frame(i, float(self.times_s[i]), rgb, depth_m)
@@ -184,6 +190,19 @@ class ImageSequence:
         return replace(made, model_places={obj: (self.path / "models" / obj,) for obj in made.objects})
 
 
+def _made_to_fit(depth: tuple[int, ...], colour: tuple[int, int]) -> str:
+    """What to do with depth images of another (height, width) than the colour images."""
+    register = "Register the depth to the colour camera first."
+    if abs(depth[0] * colour[1] - depth[1] * colour[0]) > max(colour):  # within a pixel
+        return register
+    height, width = colour
+    how = f"cv2.resize(depth, ({width}, {height}), interpolation=cv2.INTER_NEAREST)"
+    return (
+        "Does it show just what the colour image shows, as phones deliver it? Then bring each to its size without "
+        f"interpolation, which would make up depth between near and far: {how}. If it does not: {register}"
+    )
+
+
 def image_files(folder: Path) -> ImageSequence:
     """The sequence in a folder with ``rgb/``, ``depth/``, ``cam_K.txt`` and times, paired and checked."""
     rgb, depth = paired_images(folder)
@@ -213,9 +232,36 @@ def read_K(folder: Path) -> tuple[np.ndarray, str, tuple[int, int] | None]:
         return np.array(lens.intrinsic_matrix).reshape(3, 3).T, str(recorded), size  # it is written column by column
     try:
         K = images.read_numbers(path, expected)
-    except MissingData as error:
-        raise advised(error, WRITE_K) from None
+    except P2PError as error:
+        raise advised(error, WRITE_K if path.exists() else write_K(folder)) from None
     if K.size != 9:
         decimals = "A comma parts numbers: write decimals with a point, as 913.05."
-        raise BadInput(str(path), f"{K.size} numbers", expected, decimals if K.size == 18 else WRITE_K)
+        fix = decimals if K.size == 18 else _as_K(K) or WRITE_K
+        raise BadInput(str(path), f"{K.size} numbers", expected, fix)
     return K.reshape(3, 3), str(path), None
+
+
+def write_K(folder: Path) -> str:
+    """What to do in a folder without a camera matrix, of which another text file there may hold the numbers."""
+    others = [path for path in sorted(folder.glob("*")) if path.suffix.lower() in _TEXTS and path.name not in _NO_K]
+    for path in others:
+        numbers = np.empty(0)
+        with suppress(P2PError):
+            numbers = images.read_numbers(path, "numbers")
+        if said := _as_K(numbers):
+            return f"{path.name} holds four numbers. {said}"
+        if numbers.size == 9:
+            return (
+                f"{path.name} holds nine numbers: if they are the matrix fx 0 cx / 0 fy cy / 0 0 1, call it cam_K.txt."
+            )
+    likely = [path.name for path in others if re.search(_LIKELY, path.name.lower())]
+    may = f" {listed(likely, 3)} may hold them." if likely else ""
+    return f"{WRITE_K}{may}"
+
+
+def _as_K(numbers: np.ndarray) -> str:
+    """What to write into ``cam_K.txt`` of four numbers, which most programs put down in one order; else empty."""
+    if numbers.size != 4 or not np.isfinite(numbers).all():
+        return ""
+    fx, fy, cx, cy = numbers.ravel()
+    return f"If these are fx fy cx cy, write {fx:.9g} 0 {cx:.9g} / 0 {fy:.9g} {cy:.9g} / 0 0 1 into cam_K.txt."

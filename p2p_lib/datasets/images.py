@@ -18,6 +18,7 @@ import numpy as np
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData, P2PError, advised, listed, wrong_size
 from p2p_lib.core.files import LARGEST_IMAGE_PX, UNREADABLE, read_array, read_bytes, read_text, replacing
+from p2p_lib.datasets.numbering import VIDEOS, frames_of, numbered_apart, out_of_step
 
 COLOUR = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
@@ -29,6 +30,8 @@ _UNDECODED: tuple[type[Exception], ...] = (*UNREADABLE, cv2.error)
 SKIP_BAD = "p2p run --skip-bad goes on without such frames (with --resume where a run was begun)."
 #: What looks at a whole folder; left out where it has just done so.
 SEE_CHECK = "p2p check FOLDER says what else is missing."
+#: What layouts call the folder of colour images.
+COLOUR_FOLDERS = ("rgb", "color")
 #: What recorders call a folder of images.
 _IMAGES = "([-_]?(images?|maps?|frames?|png|raw|aligned|registered))?"
 _LIKELY = {
@@ -37,8 +40,6 @@ _LIKELY = {
 }
 #: The last bytes of a whole image, and within how many bytes of its end they are: some cameras fill up what follows.
 _END_MARKS = {".png": (b"IEND", 12), ".jpg": (b"\xff\xd9", 1024), ".jpeg": (b"\xff\xd9", 1024)}
-#: Numbers of two images that belong together go on alike, to this share of a step.
-_OUT_OF_STEP = 0.75
 # YCBInEOAT's rotations are orthonormal to 0.3 % only: nearer than this they are made rigid, beyond refused.
 NOT_RIGID = 0.01
 
@@ -89,18 +90,28 @@ def list_files(folder: Path, suffixes: tuple[str, ...], what: str) -> tuple[Path
         held = listed([f"{n} of kind {kind or '(none)'}" for kind, n in Counter(p.suffix for p in there).items()], 3)
         lossy = any(p.suffix.lower() in COLOUR for p in there)
         meant = "are colour and depth images swapped?" if folder.name == "depth" else "save them as PNG."
-        fix = f"JPEG keeps no exact values: {meant}" if lossy else ""
+        fix = f"JPEG keeps no exact values: {meant}" if lossy else _video_instead(folder)
         got = f"no files that fit, but {held}" if there else "no files"
         raise BadInput(str(folder), got, f"{what} ({' '.join(suffixes)})", fix)
     return tuple(sorted(files, key=_natural))
 
 
 def called_otherwise(folder: Path) -> str:
-    """What to do where a folder is there under a name that other recorders give it; empty where it is not."""
+    """What to do where a folder is there under a name that other recorders give it, or as a video; empty if not."""
     likely = _LIKELY.get(folder.name, re.escape(folder.name))
     others = (path for path in sorted(folder.parent.glob("*/")) if path != folder)
     near = [path for path in others if re.fullmatch(likely, path.name.lower())]
-    return f"Rename {near[0].name}/ to {folder.name}/." if near else ""
+    return f"Rename {near[0].name}/ to {folder.name}/." if near else _video_instead(folder)
+
+
+def _video_instead(folder: Path) -> str:
+    """How colour images are made of a video in their folder, or beside it; empty where there is none."""
+    beside = [path for path in sorted(folder.parent.glob("*")) if "depth" not in path.stem.lower()]
+    videos = [path for path in (*sorted(folder.glob("*")), *beside) if path.suffix.lower() in VIDEOS]
+    if folder.name not in COLOUR_FOLDERS or not videos:
+        return ""
+    depth = (path for path in folder.parent.glob("depth/*") if path.suffix.lower() in DEPTH)
+    return frames_of(videos[0], folder, sorted(depth, key=_natural))
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -110,16 +121,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _check_in_step(files: tuple[Path, ...], reference: tuple[Path, ...]) -> None:
     """Refuse pairs whose numbers, the last ones in their names, count images or time alike but for a jump."""
-    found = [[re.findall(r"\d+", path.stem) for path in paths] for paths in (files, reference)]
-    if len(files) < 3 or not all(numbers for of in found for numbers in of):
-        return
-    own, other = (np.array([float(numbers[-1]) for numbers in of]) for of in found)
-    step, other_step = np.median(np.diff(own)), np.median(np.diff(other))
-    if not 0 < step <= 2 * other_step or not other_step <= 2 * step:
-        return  # they count something else
-    jumps = np.flatnonzero(np.abs(np.diff(own - other)) > _OUT_OF_STEP * step)
-    if len(jumps):
-        k = int(jumps[0])
+    if (k := out_of_step(files, reference)) is not None:
         got = f"{files[k].name} with {reference[k].name}, and next {files[k + 1].name} with {reference[k + 1].name}"
         expected = f"one for each in {reference[0].parent}, with numbers that keep their distance"
         raise BadInput(str(files[0].parent), got, expected, "Take out what has no counterpart.")
@@ -129,7 +131,8 @@ def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str
     """``files``, if there is one for each of ``reference``: the i-th belongs to the i-th in sorted order.
 
     Where most are called alike, all have to be, and where none is, the numbers in their names have to keep their
-    distance: else one is missing here and one there, and those between are shifted.
+    distance: else one is missing here and one there, and those between are shifted. Names that are alike only because
+    one folder counts from 0 and the other from 1 are to be mended first: by them each would be paired with the next.
     """
     stems, wanted = {p.stem for p in files}, {p.stem for p in reference}
     if len(files) == len(reference):
@@ -139,10 +142,14 @@ def check_paired(files: tuple[Path, ...], reference: tuple[Path, ...], hint: str
             return files
         got = f"no {min(wanted - stems)}{files[0].suffix}, and {min(stems - wanted)}{files[0].suffix} instead"
         expected = f"one for each in {reference[0].parent}, called alike"
-        raise BadInput(str(files[0].parent), got, expected, "Take out what has no counterpart.")
+        apart = numbered_apart(files, reference)
+        fix = f"Both are counted apart: {apart}" if apart else "Take out what has no counterpart."
+        raise BadInput(str(files[0].parent), got, expected, fix)
     odd, fault = (wanted - stems, "missing") if len(files) < len(reference) else (stems - wanted, "too many")
     if odd and stems & wanted:
         hint = f"{min(odd)}{files[0].suffix} is {fault}. {hint}".strip()
+        if apart := numbered_apart(files, reference):
+            hint = f"{hint} Or it is not, and both are counted apart: {apart}"
     expected = f"{len(reference)}, one for each in {reference[0].parent}"
     raise BadInput(str(files[0].parent), f"{len(files)} files", expected, hint)
 
@@ -180,7 +187,8 @@ def read_numbers(path: Path, expected: str) -> np.ndarray:
         return np.loadtxt(lines, ndmin=2) if lines else np.empty(0)
     except ValueError as error:
         reason = str(error).partition(";")[0].removesuffix(".")
-        raise BadInput(str(path), f"unreadable numbers ({reason})", expected) from None
+        fix = "Write the numbers alone, without brackets." if re.search(r"[][()]", "".join(lines)) else ""
+        raise BadInput(str(path), f"unreadable numbers ({reason})", expected, fix) from None
 
 
 def read_poses(folder: Path, rgb_files: tuple[Path, ...]) -> np.ndarray:

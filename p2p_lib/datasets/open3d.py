@@ -10,14 +10,17 @@ from pathlib import Path
 
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import INTRINSICS, ImageSequence, camera_of, paired_images
+from p2p_lib.datasets.image_sequence import INTRINSICS, ImageSequence, camera_of, paired_images, write_K
 
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     """The sequence in this folder; ``masks`` as of :func:`~p2p_lib.datasets.sequence.open_sequence`."""
-    rgb, depth = paired_images(folder, "color")
     if not any((folder / name).is_file() for name in (*INTRINSICS, "cam_K.txt")):
-        fix = "Open3D's recorder writes it beside color/. If it is of another layout, name that with --format."
+        fix = (
+            "If it is of another layout, name that with --format; if it is a folder of your own, rename color/ to rgb/ "
+            f"and write cam_K.txt. {write_K(folder)}"
+        )
         raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}, as Open3D's layout (color/) has", fix)
+    rgb, depth = paired_images(folder, "color")
     files = ImageSequence(folder, rgb, depth, camera_of(folder, rgb), images.frame_times(folder, rgb))
     return files.without_truth(masks)

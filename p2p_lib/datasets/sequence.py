@@ -24,6 +24,7 @@ from p2p_lib.core.paths import data_dir
 from p2p_lib.core.plugins import find, loaded
 from p2p_lib.core.types import Frame
 from p2p_lib.datasets.images import called_otherwise, gaps_allowed
+from p2p_lib.datasets.numbering import VIDEOS
 from p2p_lib.datasets.truth import ObjectTruth, checked_truth
 
 #: Layouts, each by the name of its module: what a folder of it holds, in the order in which they are tried.
@@ -49,7 +50,6 @@ RECORDINGS = {
     ".mcap": "a recording of ROS 2",
     ".mkv": "a recording of an Azure Kinect",
 }
-_VIDEOS = (".mp4", ".avi", ".mov", ".webm", ".m4v")
 
 #: What a run's ``format`` is where its images came from a camera and were not kept.
 LIVE = "live"
@@ -296,7 +296,7 @@ def _not_a_folder(path: Path) -> BadInput:
     if is_recording(path):
         fix = f"Make a folder of it: p2p convert {path} --out FOLDER"
         return BadInput(str(path), RECORDINGS.get(suffix, "a recording of ROS 2"), "a folder of images", fix)
-    if suffix in _VIDEOS:
+    if suffix in VIDEOS:
         fix = "Record with a depth camera; a depth image for each colour image goes into depth/, cam_K.txt beside it."
         return BadInput(str(path), "a video of colour alone", "colour and depth", f"Its depth is missing. {fix}")
     return BadInput(str(path), "a file", "a folder with rgb/, depth/ and cam_K.txt", "Give the folder that it is in.")

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import subprocess
 import warnings
 from dataclasses import replace
 
@@ -713,3 +714,110 @@ def test_pairs_side_by_side_are_told_how_to_be_put(tmp_path):
         (tmp_path / f"frame-000000.{kind}").touch()
     (found,) = check_folder(tmp_path)
     assert "as in 7-Scenes" in found.text and "into rgb/" in found.fix
+
+
+def numbered(folder, first, name="{:06d}"):
+    """The images of a folder, called anew from a number on."""
+    for k, path in reversed(list(enumerate(sorted(folder.iterdir())))):
+        path.rename(folder / f"{name.format(first + k)}{path.suffix}")
+
+
+@pytest.mark.parametrize("gone", [0, 1])
+@pytest.mark.parametrize("part", ["rgb", "depth"])
+def test_a_folder_that_counts_from_1_is_renamed_and_nothing_taken_out(good, tmp_path, part, gone):
+    """By their names each image would be paired with the next one; the command that is named mends it."""
+    folder = shutil.copytree(good, tmp_path / "my ffmpeg")
+    shutil.rmtree(folder / "masks")
+    numbered(folder / part, 1)
+    for path in sorted((folder / part).iterdir())[6 - gone :]:
+        path.unlink()
+    wrong, *_ = alarms(check_folder(folder))
+    assert f"Rename those in {folder / part}, and take none out: " in wrong.fix and "ffmpeg begins with 1" in wrong.fix
+    assert ("is too many. Or" in wrong.fix or "Put them back. " in wrong.fix) == bool(gone)
+    assert "no counterpart" not in wrong.fix
+    subprocess.run(["bash", "-c", wrong.fix.partition("take none out: ")[2]], check=True)
+    assert [path.stem for path in sorted((folder / part).iterdir())] == [f"{k:06d}" for k in range(6 - gone)]
+
+
+def test_images_that_are_missing_here_and_there_are_not_taken_for_a_count_from_1(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "gaps")
+    (folder / "rgb/000002.png").unlink()
+    (folder / "depth/000004.png").unlink()
+    assert found(folder, "depth/").fix == "Take out what has no counterpart."
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("{:06d}", "3 {}/%06d.png"), ("d-{}", "3 {}/d-%d.png"), ("{:03d}x", "0 {}/%06d.png")],
+)
+def test_of_a_video_beside_depth_ffmpeg_makes_images_that_are_called_as_those(good, tmp_path, name, said):
+    folder = shutil.copytree(good, tmp_path / "video")
+    numbered(folder / "depth", 3, name)
+    shutil.rmtree(folder / "rgb")
+    (folder / "rgb.mp4").write_bytes(b"film")
+    (folder / "depth.mp4").write_bytes(b"film")
+    rgb = folder / "rgb"
+    made = f"mkdir {rgb} && ffmpeg -i {rgb}.mp4 -fps_mode passthrough -start_number {said.format(rgb)}"
+    assert found(folder, "rgb/").fix == f"rgb.mp4 is a video; its images: {made}"
+    (folder / "depth").rename(folder / "depth16")
+    with pytest.raises(BadInput, match=r"rgb\.mp4 is a video"):
+        open_sequence(folder)
+    rgb.mkdir()
+    shutil.move(folder / "rgb.mp4", rgb)
+    assert found(folder, "rgb/").fix.startswith(f"rgb.mp4 is a video; its images: ffmpeg -i {rgb}/rgb.mp4 ")
+
+
+def test_open3ds_layout_without_its_files_says_at_once_how_to_make_a_folder_of_ones_own(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "own")
+    (folder / "rgb").rename(folder / "color")
+    (folder / "cam_K.txt").unlink()
+    (folder / "intrinsics.txt").write_text("525 524 319.5 239.5\n")
+    (folder / "notes.txt").write_text("a mug\n")
+    (wrong,) = check_folder(folder)
+    K = "525 0 319.5 / 0 524 239.5 / 0 0 1"
+    assert "no camera_intrinsic.json or intrinsic.json" in wrong.text
+    assert wrong.fix == (
+        "If it is of another layout, name that with --format; if it is a folder of your own, rename color/ to rgb/ "
+        "and write cam_K.txt. intrinsics.txt holds four numbers. "
+        f"If these are fx fy cx cy, write {K} into cam_K.txt."
+    )
+    (folder / "color").rename(folder / "rgb")
+    for text, said in (
+        ("fx: 525\n", f"{WRITE_K} intrinsics.txt may hold them."),
+        ("1 0 2\n0 1 2\n0 0 1\n", "nine numbers"),
+    ):
+        (folder / "intrinsics.txt").write_text(text)
+        assert said in found(folder, "cam_K.txt").fix
+    (folder / "intrinsics.txt").write_text("525 524 319.5 239.5\n")
+    assert K in found(folder, "cam_K.txt").fix, "likewise in a plain folder"
+    shutil.copy(folder / "intrinsics.txt", folder / "cam_K.txt")
+    assert found(folder, "cam_K.txt").fix == f"If these are fx fy cx cy, write {K} into cam_K.txt."
+    (folder / "cam_K.txt").write_text(str(CAMERA.K))
+    assert found(folder, "cam_K.txt").fix == f"Write the numbers alone, without brackets. {WRITE_K}"
+    (folder / "cam_K.txt").write_text(K.replace("/", "\n"))
+    assert not [f for f in check_folder(folder) if f.name in ("files", "cam_K.txt") and not f.fine]
+
+
+def test_depth_of_half_the_size_says_how_to_enlarge_it_where_it_may_show_the_same(good, tmp_path):
+    folder = shutil.copytree(good, tmp_path / "half")
+    for size, same in (((320, 240), True), ((320, 288), False)):
+        for path in (folder / "depth").iterdir():
+            cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path), -1), size, interpolation=cv2.INTER_NEAREST))
+        wrong, *_ = check_folder(folder)
+        assert ("cv2.resize(depth, (640, 480), interpolation=cv2.INTER_NEAREST)" in wrong.fix) == same
+        assert wrong.fix.endswith("Register the depth to the colour camera first.")
+
+
+@pytest.mark.parametrize("given", ["masks", "prompts"])
+def test_a_scene_that_is_near_as_a_whole_is_doubted_beside_objects_that_count(good, tmp_path, given):
+    """Depth in centimetres of a room: its things are a tenth as far away as they are, and not too near to count."""
+    clicks = [Prompt("box", 0, [(170, 245), (190, 220), (150, 270)])] if given == "prompts" else []
+    folder = scaled_depth(shutil.copytree(good, tmp_path / "near"), 0.25)
+    depth = found(folder, "depth", prompts=clicks)
+    assert depth.level is Level.LOOK
+    assert re.search(r"^0\.2\d* m in the middle.*half of all nearer than 0\.3 m", depth.text)
+    assert "the depth scale is wrong (--depth-scale). A unit of 0.01 (centimetres)" in depth.fix
+    assert found(folder, "box: depth", prompts=clicks).level is Level.OK
+    near = check_folder(folder, prompts=clicks, sizes={"box": 16.8 / 4})
+    assert next(f for f in near if f.name == "depth").level is Level.OK, "a size that fits says that it is so near"
+    assert found(good, "depth", prompts=clicks).level is Level.OK
