@@ -226,6 +226,8 @@ def fit_plot(playback: Playback, fits: Mapping[str, Mapping[str, Series]]) -> Fi
     for k, (label, objects) in enumerate(fits.items()):
         line = {"linestyle": (0, (3 + k, 2)) if k else "-", "marker": "."}
         for name, fit in objects.items():
+            without = np.flatnonzero(~playback.run.objects[name].has_pose)
+            fit = fit.reindex(fit.index.union(without))  # a gap, and no line across it
             times_s, colour = playback.times_s[fit.index], playback.colours[name]
             axes[0].plot(times_s, 100 * fit, color=colour, label=f"{name}, {label}", **line)
     for name, obj in playback.run.objects.items():

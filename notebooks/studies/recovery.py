@@ -133,7 +133,7 @@ def around_return(
         failed = since[np.isinf(adds_mm)]
         edge = adds.get_xaxis_transform()  # data along, a fraction of the height up
         adds.plot(failed, np.full(len(failed), 0.96), "x", color=colour, transform=edge, ms=4)
-        confidence.plot(since, np.where(obj.has_pose, obj.confidence, 0)[at], **line)
+        confidence.plot(since, np.where(obj.has_pose, obj.confidence, np.nan)[at], **line)
     adds.axhline(1e3 * MAX_ADDS_M, color="#333333", lw=0.8, ls=":")
     logarithmic(adds.yaxis)
     adds.set_ylim(top=4e3 * MAX_ADDS_M)
@@ -141,7 +141,7 @@ def around_return(
         axis.set_ylabel(title)
         axis.axvline(0, color="#333333", lw=0.8)
     confidence.set(ylim=(-0.03, 1.05), xlabel="frames since the return")
-    agreeing.legend(loc="center")
+    figure.legend(*agreeing.get_legend_handles_labels(), loc="outside lower right", ncols=len(scenes))
     sight.set_title(f"{first.sequence.name}: {name} around its return")
     figure.align_ylabels(axes)
     return figure

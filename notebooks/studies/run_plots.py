@@ -89,12 +89,15 @@ def accuracy_curve(errors_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @style.styled
 def stage_timings(run: Run) -> Figure:
-    """Mean milliseconds per stage, in frames that added a keyframe and in the others."""
-    if not len(run.timings.get("total_ms", ())):
-        raise BadInput("timings", "a run without timings", "what p2p run wrote")
-    key = run.timings["keyframe"] > 0
+    """Mean milliseconds per stage, in frames that added a keyframe and in the others.
+
+    The first frame, a keyframe in which prompts become masks besides, is in no mean; the legend has its total.
+    """
+    if len(run.timings.get("total_ms", ())) < 2:
+        raise BadInput("timings", "a run without timings, or of one frame", "what p2p run wrote of two frames or more")
+    key = run.timings["keyframe"][1:] > 0
     # A stage that did not run took no time.
-    ms = {name: np.nan_to_num(values) for name, values in run.timings.items() if name.endswith("_ms")}
+    ms = {name: np.nan_to_num(values[1:]) for name, values in run.timings.items() if name.endswith("_ms")}
     order = sorted(ms, key=lambda name: (name == "total_ms", -ms[name].mean()))
     figure, (axis,) = panels(1, (WIDTH_IN, 0.6 + 0.36 * len(order)))
     for k, (which, colour, label) in enumerate(zip((~key, key), style.NEUTRAL, ("other frames", "keyframes"))):
@@ -108,7 +111,7 @@ def stage_timings(run: Run) -> Figure:
     axis.margins(x=0.08)
     axis.grid(axis="y", visible=False)
     axis.set(xlabel="milliseconds a frame, mean")
-    axis.legend(loc="upper right")
+    axis.legend(loc="upper right", title=f"not counted: the first frame, {run.timings['total_ms'][0]:.0f} ms")
     axis.set_title(f"Where the time goes, {run.info['sequence']}, tracker {run.info['tracker']}")
     return figure
 

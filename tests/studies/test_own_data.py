@@ -114,6 +114,17 @@ def test_at_the_true_pose_all_of_it_is_on_the_surface(made):
     assert (fit > 0.99).all(), "what hides it says nothing"
 
 
+def test_no_line_crosses_a_time_without_a_pose(made):
+    _, run, _ = made
+    run.objects["box"].confidence = np.where(run.objects["box"].has_pose, 0.9, 0)
+    playback = SimpleNamespace(times_s=np.arange(N) / 30, colours={"box": style.OBJECTS[0]}, run=run)
+    run.info = {"sequence": "carton"}
+    figure = own_data.fit_plot(playback, {"as estimated": {"box": pd.Series(0.9, [0, 2, 3])}})
+    fit, confidence = (axis.get_lines()[0].get_ydata() for axis in figure.axes)
+    np.testing.assert_allclose(fit, [90, np.nan, 90, 90])
+    np.testing.assert_allclose(confidence, [0.9, np.nan, 0.9, 0.9])
+
+
 def test_a_wrong_pose_shows_and_the_more_the_farther(made):
     sequence, run, bodies = made
     shares = [

@@ -72,7 +72,8 @@ def test_curves_around_the_return_are_those_of_the_run(scenes, made):
     obj = made.run.objects["box"]
     points, errors, sure = (axis.get_lines()[0] for axis in figure.axes[1:])
     assert points.get_xdata().tolist() == list(range(-16, 10))
-    np.testing.assert_array_equal(sure.get_ydata(), np.where(obj.has_pose, obj.confidence, 0)[2:28])
+    np.testing.assert_array_equal(sure.get_ydata(), np.where(obj.has_pose, obj.confidence, np.nan)[2:28])
+    assert np.isnan(sure.get_ydata()).any(), "no pose, no confidence: not one of 0"
     score = made.evaluation.objects["box"]
     (row,) = np.flatnonzero(score.frame_index == 7)
     assert errors.get_ydata()[7 - 2] == 1e3 * score.adds_m[row] > 1 and np.isnan(errors.get_ydata()[8 - 2])
