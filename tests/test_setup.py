@@ -3,7 +3,6 @@
 import ast
 import importlib
 import importlib.util
-import json
 import os
 import re
 import shutil
@@ -12,7 +11,6 @@ import sys
 import time
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from packaging.requirements import Requirement
@@ -300,22 +298,6 @@ def make_whole(checkout: Path, bootstrap) -> None:
     (checkout / ".venv" / "bin").mkdir(parents=True)
     (checkout / ".venv" / "bin" / "python").symlink_to(sys.executable)
     (checkout / ".venv" / ".p2p-stamp").write_text(bootstrap.stamp_of(checkout, "cpu"))
-
-
-def test_the_quickstart_installs_what_it_lacks(monkeypatch):
-    """Its first cell of code, as Colab runs it: without p2p_lib, and with it."""
-    import IPython
-
-    cells = json.loads((PROJECT / "notebooks" / "00_quickstart.ipynb").read_text())["cells"]
-    first = next("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    asked = []
-    shell = SimpleNamespace(run_line_magic=lambda *words: asked.append(words))
-    monkeypatch.setattr(IPython, "get_ipython", lambda: shell)
-    exec(first, {})
-    assert not asked, "it is installed here"
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    exec(first, {})
-    assert asked == [("pip", f"install -q '{PYPROJECT['project']['name']}[notebooks,view]'")]
 
 
 def test_the_container_is_given_what_the_set_up_reads(bootstrap, tmp_path):

@@ -133,7 +133,7 @@ def test_commands_of_a_clone_say_that_they_need_one(p2p):
         said = p2p("p2p", *command, code=2)
         assert said.splitlines() == [
             f"p2p {command[0]}: notebooks: they are not part of the installed package. "
-            "Clone the repository and call this inside it."
+            "Clone the repository and call this inside it (papermill: --cwd CLONE/notebooks)."
         ]
 
 

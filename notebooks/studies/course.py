@@ -6,18 +6,40 @@ import html
 from dataclasses import dataclass
 from functools import cache
 
-from p2p_lib.core.errors import BadInput
+from p2p_lib.core.errors import BadInput, MissingBackend
+from p2p_lib.core.native import load_open3d
 from studies.pipeline_diagram import STAGES, as_svg, pipeline_diagram
+
+#: What loads the package of an extra as the notebooks' own code does, and says what to do where it cannot.
+_LOADS = {"open3d": load_open3d}
 
 
 @dataclass(frozen=True)
 class Lesson:
-    """One notebook: its file without suffix, a title of a few words, where the paper has it, what it shows."""
+    """One notebook: its file without suffix, a title of a few words, where the paper has it, what it shows.
+
+    extra  of the package, besides ``notebooks``, that it cannot run without; empty for most
+    """
 
     name: str
     title: str
     paper: str
     shows: str
+    extra: str = ""
+
+    @property
+    def about(self) -> str:
+        """What it shows, and what it needs."""
+        return self.shows + (f"; needs the extra {self.extra}" if self.extra else "")
+
+    def check_installed(self) -> None:
+        """:class:`MissingBackend` with the command where the extra that it needs is not there."""
+        try:
+            if self.extra:
+                _LOADS[self.extra]()
+        except MissingBackend as error:
+            needs = f"needs the extra {self.extra}, which is not there ({error.missing})"
+            raise MissingBackend(f"notebook {self.name}", needs, error.fix) from error
 
     @property
     def stages(self) -> list[str]:
@@ -27,7 +49,7 @@ class Lesson:
     def _repr_html_(self) -> str:
         at = LESSONS.index(self)
         before, after = LESSONS[at - 1] if at else None, LESSONS[at + 1] if at + 1 < len(LESSONS) else None
-        contents = "".join(f"<li>{_link(one, one is not self)}: {html.escape(one.shows)}</li>" for one in LESSONS)
+        contents = "".join(f"<li>{_link(one, one is not self)}: {html.escape(one.about)}</li>" for one in LESSONS)
         about = "The filled boxes are what this notebook is about." if self.stages else "This notebook uses all of it."
         return (
             '<nav style="display:flex;justify-content:space-between;gap:2em">'
@@ -111,15 +133,20 @@ LESSONS = (
         "Label your own",
         'the fused surface alone, section "3D Reconstruction"; offline pass, textured models and labels are ours',
         "from a video and three clicks to a textured model and labelled images, and how to tell that a label is good",
+        extra="open3d",
     ),
 )
 
 
 def lesson(number: str) -> Lesson:
-    """The notebook of this number (``"03"``); shown as its way through the course and its place in the pipeline."""
+    """The notebook of this number (``"03"``); shown as its way through the course and its place in the pipeline.
+
+    It is each notebook's first line: where what the notebook needs is not installed, it says so and nothing is begun.
+    """
     found = [one for one in LESSONS if one.name[:2] == number]
     if not found:
         raise BadInput("notebook", repr(number), "one of " + ", ".join(one.name[:2] for one in LESSONS))
+    found[0].check_installed()
     return found[0]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import cv2
@@ -28,6 +29,12 @@ from p2p_lib.synthetic.shapes import load_mesh
 
 #: A true surface shows where depth was measured so near it; a model lacks what is farther from it than that, m.
 SEEN_M, LACKS_M = 0.005, 0.01
+
+
+def fresh(folder: Path) -> Path:
+    """The folder without what an earlier call of the same cell left there: exports and runs want a new one."""
+    rmtree(folder, ignore_errors=True)
+    return folder
 
 
 def read_model(folder: Path) -> Textured:

@@ -103,8 +103,9 @@ def run_notebooks(
     folder      where the notebooks are, default ``notebooks/`` of the project
     say         is told of progress, line by line
 
-    Raises :class:`BadInput` for unknown parameters before anything runs, and :class:`NotebookFailed` at the first
-    notebook with a failing cell; what ran so far is on disk and in the gallery.
+    Raises :class:`BadInput` for unknown parameters and :class:`MissingBackend` for an extra that a notebook lacks,
+    both before anything runs, and :class:`NotebookFailed` at the first notebook with a failing cell; what ran so far is
+    on disk and in the gallery.
     """
     with needed_for("notebooks"):
         for package in ("jinja2", "nbconvert", "papermill"):
@@ -118,6 +119,9 @@ def run_notebooks(
         fix = "The profile is chosen by --profile, in Python by profile=."
         raise BadInput("parameter", "PROFILE", "one of a notebook's others", fix)
     given = {**(parameters or {}), "PROFILE": profile}
+    for one in course.LESSONS:
+        if one.name in {path.stem for path in paths}:
+            one.check_installed()
     plans = [(path, _fitting_parameters(path, given)) for path in paths]
     own = [re.sub(r"[^\w.]+", "-", f"{name}={value}") for name, value in (parameters or {}).items()]
     home = (out or CLONE / "out" / "_".join([profile, *own])).resolve()
@@ -219,13 +223,13 @@ def write_gallery(home: Path, profile: str) -> Path:
     results = [read_result(path) for path in sorted((home / "notebooks").glob("*.ipynb"))]
     there = {result.name for result in results}
     for page in (home / "notebooks").glob("*.html"):
-        page.write_text(_as_pages(page.read_text(encoding="utf-8"), there), encoding="utf-8")
+        page.write_text(as_pages(page.read_text(encoding="utf-8"), there), encoding="utf-8")
     seconds, claims = sum(r.seconds for r in results), sum(len(r.checks) for r in results)
     templates = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
     html = templates.get_template("gallery.html").render(
         title=f"Point2Pose notebooks, profile {profile}",
         summary=f"{_counted(results)}, {seconds:.0f} s, {claims} claims checked",
-        diagram=_as_pages(course.diagram().replace('href="', 'href="notebooks/'), there),
+        diagram=as_pages(course.diagram().replace('href="', 'href="notebooks/'), there),
         missing=[lesson.name for lesson in course.LESSONS if lesson.name not in there],
         lessons={lesson.name: lesson for lesson in course.LESSONS},
         failed=sum(bool(result.error) for result in results),
@@ -255,7 +259,7 @@ def _run_one(
             kernel_manager_class=kernel_manager,
             progress_bar=False,
         )
-    _write_page(executed)
+    write_page(executed, executed.with_suffix(".html"))
     result = read_result(executed)
     outcome = "FAILED" if result.error else f"{len(result.checks)} claims checked"
     say(f"{source.stem}: {result.seconds:.1f} s, {outcome}")
@@ -319,8 +323,8 @@ def _fitting_parameters(path: Path, given: Mapping[str, Any]) -> dict[str, Value
     return values
 
 
-def _write_page(executed: Path) -> None:
-    """The executed notebook as a page for the browser, beside it; nothing in it is fetched from the network.
+def write_page(notebook: Path, page: Path) -> None:
+    """A notebook, executed or not, as a page for the browser; nothing in it is fetched from the network.
 
     Its links are to notebooks, until the gallery knows which of their pages are there.
     """
@@ -340,11 +344,11 @@ def _write_page(executed: Path) -> None:
     template = Path(__file__).with_name("notebook.html").read_text(encoding="utf-8")
     exporter = HTMLExporter(embed_images=True, raw_template=template)
     exporter.register_filter("markdown2html", as_html)
-    body, _ = exporter.from_filename(str(executed), resources={"equation_style": equations.STYLE})
-    executed.with_suffix(".html").write_text(body, encoding="utf-8")
+    body, _ = exporter.from_filename(str(notebook), resources={"equation_style": equations.STYLE})
+    page.write_text(body, encoding="utf-8")
 
 
-def _as_pages(html: str, there: Collection[str]) -> str:
+def as_pages(html: str, there: Collection[str]) -> str:
     """Links from notebook to notebook as links to the pages that are there; others wait for theirs as ``data-href``."""
 
     def link(found: re.Match[str]) -> str:

@@ -4,6 +4,7 @@ import ast
 import math
 import os
 import re
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,9 +14,10 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from p2p_lib.apps import cli
+from p2p_lib.apps import clone as apps_clone
 from p2p_lib.core import compiled
-from p2p_lib.core.errors import BadInput, MissingData
-from studies import runner
+from p2p_lib.core.errors import BadInput, MissingBackend, MissingData
+from studies import course, runner
 from studies.claims import Claim, check
 from studies.course import LESSONS
 from studies.runner import (
@@ -29,6 +31,7 @@ from studies.runner import (
 
 SUITE = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 MAX_CELL_LINES = 15
+FIRST = 'from p2p_lib.apps.clone import study\n\nstudy("course").lesson("{}")'  # the first cell of code of each
 PARAMETERS = "PROFILE = 'quick'\nSEED: int = 0\nSCALE = 1.0\nNAME = 'a'"
 CHECKS = """from studies.claims import Claim, check
 check(
@@ -81,7 +84,7 @@ def course_problems(path: Path) -> list[str]:
     code = [cell.source for cell in cells if cell.cell_type == "code"]
     text = [cell.source for cell in cells if cell.cell_type == "markdown"]
     names = [one.name for one in LESSONS]
-    problems = [] if f'lesson("{path.stem[:2]}")' in code[0] else ["does not begin with its lesson"]
+    problems = [] if code[0] == FIRST.format(path.stem[:2]) else ["does not begin with its lesson"]
     problems += [f"{call} without a caption" for source in code for call in uncaptioned(source)]
     problems += [
         f"{call} is not the last of its cell, so it is not shown" for source in code for call in unshown(source)
@@ -231,6 +234,46 @@ def test_the_browser_sees_what_is_not_shown(tmp_path, browser):
     seen = browser.figures(page)
     assert [(f["kind"], f["width"]) for f in seen] == [("IMG", 0), ("IMG", 1), ("VIDEO", 0)]
     assert seen[1]["shown_px"] == 1600
+
+
+@pytest.mark.parametrize("clone", [True, False])
+def test_the_first_cell_finds_the_clone_from_any_folder_or_says_what_to_do(tmp_path, monkeypatch, clone):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "studies"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(SUITE[0].parent))])
+    monkeypatch.chdir(tmp_path)
+    if clone:
+        exec(FIRST.format("03") + "\nfrom studies import claims", {})
+        return
+    monkeypatch.setattr(apps_clone, "PROJECT", tmp_path / "site-packages")
+    with pytest.raises(MissingData, match=r"Clone the repository .* --cwd CLONE/notebooks"):
+        exec(FIRST.format("03"), {})
+
+
+# What needs an extra besides the notebooks' own
+
+
+@pytest.fixture
+def without_open3d(monkeypatch):
+    def load():
+        raise MissingBackend("open3d", "No module named 'open3d'", "Run: pip install 'p2p_lib[open3d]'")
+
+    monkeypatch.setitem(course._LOADS, "open3d", load)
+    return r"^notebook 11_label_your_own: needs the extra open3d, .*Run: pip install 'p2p_lib\[open3d\]'"
+
+
+def test_a_notebook_without_its_extra_says_so_in_its_first_cell(without_open3d):
+    with pytest.raises(MissingBackend, match=without_open3d):
+        course.lesson("11")
+    assert course.lesson("10").name == "10_your_own_data"
+
+
+def test_nothing_runs_where_one_of_the_notebooks_lacks_its_extra(tmp_path, without_open3d):
+    write(tmp_path / "10_your_own_data.ipynb")
+    write(tmp_path / "11_label_your_own.ipynb")
+    with pytest.raises(MissingBackend, match=without_open3d):
+        run_notebooks(out=tmp_path / "out", folder=tmp_path, say=lambda line: None)
+    assert not (tmp_path / "out").exists()
 
 
 # The runner
@@ -498,6 +541,14 @@ def test_all_claims_that_fail_are_named():
     with pytest.raises(AssertionError, match=r"^a: 1, not at least 2 \(x\); c: no, not yes \(z\)$"):
         check(*claims)
     check(claims[1])
+    check(*claims, bars=False)
+
+
+def test_without_bars_all_is_told_and_nothing_has_to_hold():
+    claims = Claim("a", 1, "x", at_least=2), Claim("c", False, "z"), Claim("d", True, "y"), Claim("e", "words", "w")
+    told = [claim.told for claim in claims]
+    assert [claim.value for claim in told] == [1, "no", "yes", "words"] and all(told)
+    assert {claim.row[""] for claim in told} == {"for information"}
 
 
 @pytest.mark.parametrize(
