@@ -23,6 +23,7 @@ book: docs ## notebooks as make reproduce left them, and the API reference, as o
 	@test -f out/quick/index.html || $(MAKE) reproduce
 	@rm -rf out/book && mkdir -p out/book/notebooks
 	@cp out/quick/index.html out/book && cp out/quick/notebooks/*.html out/book/notebooks && cp -r out/docs out/book/api
+	@rm -r out/book/api/notebooks && sed -i -E 's|href="((\.\./)*)notebooks/|href="\1../notebooks/|g' $$(find out/book/api -name '*.html')
 	@sed -i 's|</h1>|</h1><p><a href="api/index.html">API reference</a></p>|' out/book/index.html
 	@echo "Open out/book/index.html"
 

@@ -1,7 +1,7 @@
 """What users read as pages that need nothing else: ``make docs`` fills out/docs.
 
-The reference from the docstrings, first the names of ``p2p_lib`` itself; README and all that it leads to; a page for
-the lines of JSON that ``p2p live`` writes and reads.
+The reference from the docstrings, first the names of ``p2p_lib`` itself; README and all that it leads to, of notebooks
+their words and code (``make book`` has them executed); a page for the lines of JSON that ``p2p live`` writes and reads.
 """
 
 import json
@@ -22,6 +22,7 @@ from markdown2 import markdown
 from PIL import Image
 
 import p2p_lib
+from p2p_lib.apps.clone import study
 
 ROOT = Path(__file__).resolve().parents[1]
 #: What a page has of its own to the suffix of a file and how pages get it.
@@ -81,11 +82,20 @@ def documents(out):
             _write(out, _page(name), re.sub("[#*`]", "", text.splitlines()[0]).strip(), _turned(text, name, linked))
         else:
             (out / name).parent.mkdir(parents=True, exist_ok=True)
-            if at.suffix == ".png":
+            if at.suffix == ".ipynb":
+                _write_notebook(at, out / _page(name))
+            elif at.suffix == ".png":
                 Image.open(at).save(out / _page(name), quality=80)
             else:
                 shutil.copy(at, out / name)
         to_do += linked
+
+
+def _write_notebook(at, page):
+    runner = study("runner")
+    runner.write_page(at, page)
+    there = {path.stem for path in runner.list_notebooks()}
+    page.write_text(runner.as_pages(page.read_text(encoding="utf-8"), there), encoding="utf-8")
 
 
 def _turned(text, name, linked):
@@ -105,7 +115,7 @@ def _turned(text, name, linked):
 
 def _page(name):
     """What a file of the repository is called here; pictures are smaller as WebP."""
-    return re.sub(r"\.png$", ".webp", re.sub(r"\.md$", ".html", name))
+    return re.sub(r"\.png$", ".webp", re.sub(r"\.(md|ipynb)$", ".html", name))
 
 
 def _write(out, name, title, text):
@@ -139,12 +149,12 @@ def json_lines(out):
 
 
 def _share(out):
-    """Styles and scripts, which pdoc repeats on every page, become files; links to what it leaves out go.
+    """Styles and scripts, which pdoc and notebooks repeat on every page, become files; links to what is left out go.
 
     So do empty lines outside of code, which weigh a tenth of a megabyte.
     """
     files = {}
-    for page in [out / "p2p_lib.html", *out.glob("p2p_lib/**/*.html")]:
+    for page in [out / "p2p_lib.html", *out.glob("p2p_lib/**/*.html"), *out.glob("notebooks/*.html")]:
         text = page.read_text(encoding="utf-8")
         up = "../" * (len(page.relative_to(out).parts) - 1)
 
@@ -153,7 +163,7 @@ def _share(out):
             name = files.setdefault(found[2], f"shared{len(files)}.{suffix}")
             return link.format(up + name)
 
-        text = re.sub(r"<(style|script)>(.*?)</\1>", linked, text, flags=re.DOTALL)
+        text = re.sub(r'<(style|script)(?: type="text/css")?>(.*?)</\1>', linked, text, flags=re.DOTALL)
         text = re.sub(r'<a href="#_\w+">(.*?)</a>', r"\1", text)
         parts = re.split(r"(<pre\b.*?</pre>)", text, flags=re.DOTALL)
         parts[::2] = (_EMPTY_LINES.sub("\n", part) for part in parts[::2])
@@ -209,9 +219,9 @@ def write(out):
     with warnings.catch_warnings():
         warnings.filterwarnings("error", module="pdoc")
         pdoc.pdoc(*modules(), output_directory=out)
-    _share(out)
     documents(out)
     json_lines(out)
+    _share(out)
     shutil.copy(out / "README.html", out / "index.html")
     if dead := list(dead_links(out)):
         sys.exit("\n".join(["These links of the reference lead nowhere:", *dead]))
