@@ -75,7 +75,7 @@ class Keeper:
         for name, mask in method.masks.items():
             if mask is not None:
                 self.mask_log.add(frame, name, mask)
-        return self.first_masks.add(frame, method.masks, anew)
+        return self.first_masks.add(frame, method.masks, anew, method.refused)
 
     def save_maps(self) -> None:
         """``meshes/<object>.ply`` and ``maps/<object>.npz`` of each surface in its object's frame, and the two logs."""

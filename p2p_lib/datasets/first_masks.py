@@ -39,11 +39,16 @@ class FirstMasks:
         self._started, self._panels, self._corrected = list[str](), list[np.ndarray](), list[np.ndarray]()
 
     def add(
-        self, frame: Frame, masks: Mapping[str, np.ndarray | None], anew: Iterable[str] = ()
+        self,
+        frame: Frame,
+        masks: Mapping[str, np.ndarray | None],
+        anew: Iterable[str] = (),
+        refused: Iterable[str] = (),
     ) -> tuple[list[str], list[str]]:
         """The masks that served in a frame; which objects are new in it, and which were corrected: both are drawn.
 
-        anew  objects that were added since the frame before, under a name that another one had, too
+        anew     objects that were added since the frame before, under a name that another one had, too
+        refused  those whose last prompt was not used: it corrects nothing
         """
         self._followed = (self._followed & masks.keys()).difference(anew)  # what was removed may be added again
         seen = {name: mask for name, mask in masks.items() if mask is not None and mask.any()}
@@ -51,7 +56,7 @@ class FirstMasks:
         newest = {prompt.name: prompt for prompt in said}
         now = {name for name, prompt in newest.items() if prompt.frame == frame.index}
         new = {name: mask for name, mask in seen.items() if name not in self._followed}
-        again = {name: mask for name, mask in seen.items() if name in self._followed & now}
+        again = {name: mask for name, mask in seen.items() if name in (self._followed & now).difference(refused)}
         self._followed |= new.keys()
         self._started = list(dict.fromkeys([*self._started, *new]))
         colours = object_colours(dict.fromkeys([*(prompt.name for prompt in self._prompts), *self._started]))

@@ -57,6 +57,16 @@ def test_what_was_said_meanwhile_is_drawn_and_an_object_that_was_added_again(tmp
     assert (again[100, 10] == cup).all() and (again[65, 65] == GRAY).all() and (again[29, 50:80] == cup).all()
 
 
+def test_a_correction_that_was_not_used_is_not_drawn_as_one(tmp_path):
+    firsts = FirstMasks(tmp_path / "first.png", [Prompt("cup", 0, [[65, 65]]), Prompt("cup", 2, [[10, 10]])])
+    masks = {"cup": square(50, 50)}
+    assert firsts.add(picture(0), masks) == (["cup"], [])
+    before = read(tmp_path / "first.png")
+    assert firsts.add(picture(2), masks, refused={"cup": "no depth"}) == ([], [])
+    np.testing.assert_array_equal(read(tmp_path / "first.png"), before)
+    assert firsts.add(picture(2), masks) == ([], ["cup"])
+
+
 def test_no_object_is_smaller_by_itself_than_in_the_frame(tmp_path):
     mask = np.zeros((600, 800), bool)
     mask[100:500, 100:600] = True
