@@ -23,7 +23,7 @@ from p2p_lib.datasets.mask_log import load_masks
 from p2p_lib.datasets.runs import ObjectRun, Run, load_run
 from p2p_lib.datasets.sequence import Sequence, reopen_if_there
 from p2p_lib.evaluation.evidence import ON_M, depth_as_taken, gathered, reprojected, surface_in_view
-from p2p_lib.evaluation.known_size import lengths
+from p2p_lib.evaluation.known_size import lengths, mesh_length_m
 from p2p_lib.evaluation.protocol import MIN_VISIBLE_PX, ran_with, rate
 from p2p_lib.evaluation.suspicions import Suspicion, suspicions
 
@@ -138,7 +138,7 @@ def consistency(
         doubts = tuple(str(of) for of in run.doubts if of.object in (None, name) and of.kind != DEPTH_MOVED)
         moved = run.info.get("disagrees_above_3_sigma", {}).get(name, ())
         kept_of = masks.get(name), keypoints.get(name)
-        evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved)
+        evidence = gathered(obj, of_every_map, sequence, *kept_of, fit, doubts, moved, mesh_length_m(mesh)[0])
         off = (Suspicion("known size", sizes[name]),) if name in sizes else ()
         found[name] = off + suspicions(evidence)
         if obj.has_pose.any() and not evidence.compared:

@@ -105,12 +105,14 @@ def gathered(
     fit: SurfaceFit,
     doubts: tuple[str, ...],
     moved: Collection[int] = (),
+    surface_m: float = float("nan"),
 ) -> RunEvidence:
     """All that is known of one object, frame by frame.
 
-    every   the same object with the poses of all its maps
-    doubts  what was doubted of it when the run was made
-    moved   frames whose pose an offline pass has moved far
+    every      the same object with the poses of all its maps
+    doubts     what was doubted of it when the run was made
+    moved      frames whose pose an offline pass has moved far
+    surface_m  the length of its surface; NaN: unknown
     """
     n = len(obj)
     px, size_m, cut, apart = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool), 0.0
@@ -129,7 +131,7 @@ def gathered(
     seen, inside, off_px, jump_px = of_points
     compared = seen, inside, off_px, jump_px, fit.overlap, fit.through, fit.on_surface
     far = np.isin(obj.frame_index, list(moved))
-    return RunEvidence(*of_poses, px, size_m, cut, *compared, far, doubts, apart)
+    return RunEvidence(*of_poses, px, size_m, cut, *compared, far, doubts, apart, surface_m)
 
 
 def drawn_m(scene: Any, camera: Camera, T_cam_obj: np.ndarray, at: Any = np.s_[:, :]) -> np.ndarray:

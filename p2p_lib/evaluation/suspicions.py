@@ -52,6 +52,7 @@ class RunEvidence:
     moved         (n,) bool: by an offline pass, more than three sigmas from the causal pose
     doubts        what was doubted when the run was made, in words
     apart         the share of the first mask that is apart from its largest part
+    surface_m     the length of the surface
     """
 
     frame_index: np.ndarray
@@ -71,6 +72,7 @@ class RunEvidence:
     moved: np.ndarray
     doubts: tuple[str, ...] = ()
     apart: float = 0.0
+    surface_m: float = float("nan")
 
     @property
     def seen(self) -> np.ndarray:
@@ -79,8 +81,11 @@ class RunEvidence:
 
     @property
     def usual_m(self) -> float:
-        """The length of what masks hold that the image does not cut; NaN where it cuts all."""
-        return median_of_known(self.size_m[self.seen & ~self.cut])
+        """The length of what masks hold that the image does not cut; NaN where it cuts all.
+
+        Where the surface is longer, most of the masks hold a part of the object alone, and its length counts.
+        """
+        return float(np.fmax(median_of_known(self.size_m[self.seen & ~self.cut]), self.surface_m))
 
     @property
     def carried(self) -> np.ndarray:

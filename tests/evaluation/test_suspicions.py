@@ -140,9 +140,19 @@ def test_what_is_not_known_is_not_held_against_anybody():
         "cut",
         "doubts",
         "apart",
+        "surface_m",
     }
     nothing = replace(spotless(), **{key: np.full(N, np.nan) for key in unknown})
     assert suspicions(nothing) == () and spotless().compared and not nothing.compared
+
+
+def test_masks_as_long_as_the_surface_are_not_too_long():
+    """Where most of the masks hold a part of the object, what is usual is no measure."""
+    parts = with_some(spotless(), 0.4, size_m=0.28)
+    assert {s.rule for s in suspicions(parts)} == {"grown"}
+    assert not suspicions(replace(parts, surface_m=0.29))
+    assert {s.rule for s in suspicions(replace(parts, surface_m=0.2))} == {"grown"}
+    assert {s.rule for s in suspicions(replace(parts, surface_m=0.1))} == {"grown"}, "a surface may be a part, too"
 
 
 def test_what_the_image_cuts_is_not_the_usual_length():
