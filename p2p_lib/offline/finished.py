@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from p2p_lib.core import se3
@@ -31,6 +32,9 @@ RULE = (
     "An image is labelled where every object of the run either has a pose of confidence above {0:g}, or has neither"
     " a pose nor a pixel in the masks that the run used."
 )
+
+#: Pixels of a mask or a surface are beside the other if farther from it than this share of their own size, px.
+_BESIDE, _FRINGE_PX = 0.03, 3
 
 
 def load_posed(folder: str | Path, min_confidence: float = 0.0) -> Run:
@@ -110,6 +114,16 @@ class Finished:
         rows = {name: (log, log.row(frame)) for name, log in self._coarse.items() if name in self.run.objects}
         cells = {name: log.cells(row, shape) for name, (log, row) in rows.items() if row is not None}
         return {n: c.repeat(CELL_PX, 0).repeat(CELL_PX, 1)[: shape[0], : shape[1]] for n, c in cells.items()}
+
+    def beside(self, shown: np.ndarray, other: np.ndarray) -> float:
+        """The share of a surface's pixels (H, W) bool that lie beside its mask, or the other way round; NaN of none.
+
+        Coarse masks and lost fringes of a surface are no parts that lie beside.
+        """
+        px = np.count_nonzero(shown)
+        reach_px = _FRINGE_PX + _BESIDE * np.sqrt(px) + (0 if self.exact_masks else CELL_PX)
+        away_px = cv2.distanceTransform((~other).astype(np.uint8), cv2.DIST_L2, 5)
+        return np.count_nonzero(shown & (away_px > reach_px)) / px if px else float("nan")
 
     def surface(self, name: str) -> Any:
         """The reconstructed surface of an object, a ``trimesh.Trimesh`` in its frame, metres, with colours."""

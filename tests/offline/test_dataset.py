@@ -8,13 +8,15 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from p2p_lib.apps import cli
 from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput, MissingData
+from p2p_lib.core.mesh import save
 from p2p_lib.datasets.exchange import FORMATS
 from p2p_lib.datasets.models import MESHES, find_models, load_points
-from p2p_lib.offline.dataset import agreement, doubtful, visible
+from p2p_lib.offline.dataset import BESIDE, agreement, doubtful, visible
 from p2p_lib.offline.finished import Silhouette
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
@@ -57,6 +59,23 @@ def test_depth_makes_a_label_doubtful_that_fills_its_mask(finished, tmp_path):
     for i in (10, 11, 12):
         assert float(rows[i]["visib_iou"]) > 0.8 and float(rows[i]["depth_on_surface"]) < 0.6
     assert "depth" in json.loads((out / "labels.json").read_text())["doubtful"]
+
+
+def test_a_model_that_holds_more_than_its_object_makes_its_labels_doubtful(finished, tmp_path):
+    """A strip of the table beside it: depth lies on it, and masks and what shows overlap well enough."""
+    surface = trimesh.load(finished / "meshes/box.ply")
+    low, high = surface.bounds
+    strip = trimesh.creation.box(bounds=[[high[0], low[1], low[2]], [high[0] + 0.12 * (high - low)[0], *high[1:]]])
+    strip.visual.vertex_colors = np.full((len(strip.vertices), 3), 128, np.uint8)
+    save(trimesh.util.concatenate([surface, strip]), finished / "meshes/box.ply")
+    said = write_product(finished, "bop-dataset", out := tmp_path / "set")
+    rows = list(csv.DictReader((out / "labels.csv").open()))
+    share = {name: np.median([float(r["beside_mask"]) for r in rows if r["object"] == name]) for name in ("box", "can")}
+    assert share["can"] < 0.01 and share["box"] > BESIDE
+    assert {row["object"] for row in rows if row["doubtful"] == "True"} == {"box"}
+    told = f"beside the masks lies {100 * share['box']:.1f} % of box, {100 * share['can']:.1f} % of can"
+    assert f"{told}: the model of box holds more than the object" in said
+    assert json.loads((out / "labels.json").read_text())["beside_masks"] == pytest.approx(share, abs=1e-4)
 
 
 def test_holes_and_hands_make_no_label_doubtful():
