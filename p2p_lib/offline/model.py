@@ -9,6 +9,7 @@ sides of the smallest box around the model, longest first, however the object fr
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,15 @@ from p2p_lib.core import se3
 from p2p_lib.core.errors import BadInput
 from p2p_lib.core.files import replace_text, replacing
 from p2p_lib.core.image import nearest_px
-from p2p_lib.core.mask_length import CELL_PX
 from p2p_lib.core.mesh import oriented_box
 from p2p_lib.core.native import load_open3d
+from p2p_lib.core.options import lengths_m
 from p2p_lib.core.progress import progress_bar
 from p2p_lib.core.types import DOUBTED, evenly
 from p2p_lib.datasets.images import save_png
 from p2p_lib.datasets.runs import ObjectRun
+from p2p_lib.evaluation.consistency import Consistency, consistency
+from p2p_lib.evaluation.suspicions import Suspicion
 from p2p_lib.offline import holes, texture
 from p2p_lib.offline.finished import Finished, Renderer, new_folder
 
@@ -39,9 +42,9 @@ _SEEN_THROUGH_M, _SEEN_THROUGH_VIEWS = 0.012, 2
 _HOLES = 10
 #: Faces of a collision mesh, at most.
 _HULL_FACES = 256
-#: A mask's pixels are beside a model if farther from it than this share of the mask's size; if more than so many are,
-#: a part is missing. (A real mug without its handle: 4 to 5 %; 45 other objects of 22 runs: at most 1.7 %.)
-_BESIDE, _MISSING = 0.03, 0.025
+#: If more than this share of the masks' pixels lie beside a model, a part is missing. (A real mug without its handle:
+#: 4 to 5 %; 45 other objects of 22 runs: at most 1.7 %.)
+_MISSING = 0.025
 #: Of poses so many of which are doubted a model may have parts twice, whose surface was fused at them.
 _OFTEN_DOUBTED = 0.2
 #: The edge of a texture, px, at least and at most, and the room around its charts.
@@ -88,15 +91,17 @@ def write_models(
         raise BadInput("faces", faces, "at least 100")
     open3d = load_open3d()
     made, lines = Finished.of(folder), []
+    sizes = (made.run.info.get("options") or {}).get("sizes")
+    judged = consistency(made.run, made.sequence, known_m=lengths_m(sizes, made.run.objects))
     quiet = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
     with quiet, new_folder(out) as there, progress_bar("models", len(made.tracked), "object", progress) as bar:
         for name in made.tracked:
-            lines.append(_write_model(made, name, there / name, faces, min_confidence))
+            lines.append(_write_model(made, judged, name, there / name, faces, min_confidence))
             bar.update()
     return "; ".join(lines)
 
 
-def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidence: float) -> str:
+def _write_model(made: Finished, judged: Consistency, name: str, out: Path, faces: int, min_confidence: float) -> str:
     obj, surface = made.run.objects[name], made.surface(name)
     rows = np.flatnonzero(obj.has_pose & (obj.confidence > min_confidence))
     if not len(rows):
@@ -119,10 +124,11 @@ def _write_model(made: Finished, name: str, out: Path, faces: int, min_confidenc
     off_model = beside(made, name, tried, Renderer(shape.vertices, shape.faces, camera))
     about = _about(made, name, textured, len(views), off)
     about |= {"masks_beside": round(off_model, 4), "collision_faces": len(hull.faces)}
+    about |= {"verdict": judged.verdict(name), "look_at": [found.text for found in judged.suspicions[name]]}
     replace_text(out / "model.json", json.dumps(about, indent=1, ensure_ascii=False) + "\n")
     guessed = f", {100 * about['guessed_share']:.0f} % of its area unseen, guessed" if shape.guessed.any() else ""
     textured_of = f"{len(shape.faces)} faces, texture of {len(views)} view{'s' * (len(views) != 1)}"
-    line = f"{name}: {often_doubted(obj)}{textured_of}{guessed}{no_better(off)}{lacks(off_model)}"
+    line = f"{name}: {suspect(obj, judged.suspicions[name])}{textured_of}{guessed}{no_better(off)}{lacks(off_model)}"
     return line + how_open(about["parts"], about["holes"], about["largest_hole_m"], bool(made.about.get("offline")))
 
 
@@ -161,21 +167,23 @@ def beside(made: Finished, name: str, rows: np.ndarray, render: Renderer) -> flo
         if mask is None or not mask.any():
             continue
         shown = np.isfinite(render(made.run.objects[name].T_cam_obj[row]).depth_in(mask))
-        # Coarse masks and lost fringes of a surface are no missing parts.
-        reach_px = 3 + _BESIDE * np.sqrt(mask.sum()) + (0 if made.exact_masks else CELL_PX)
-        away_px = cv2.distanceTransform((~shown).astype(np.uint8), cv2.DIST_L2, 5)
-        found.append(np.count_nonzero(mask & (away_px > reach_px)) / np.count_nonzero(mask))
+        found.append(made.beside(mask, shown))
     return float(np.median(found[1:] or found))
 
 
-def often_doubted(obj: ObjectRun) -> str:
-    """What there is to say, before anything else, of a model that was made of poses which are often doubted."""
-    share = float(obj.doubted.sum() / obj.has_pose.sum())
-    if share < _OFTEN_DOUBTED:
+def suspect(obj: ObjectRun, found: Iterable[Suspicion]) -> str:
+    """What there is to say, before anything else, of a model that was made of poses which are suspect.
+
+    found  what speaks against them by ``p2p eval``
+    """
+    share, rules = float(obj.doubted.sum() / obj.has_pose.sum()), dict.fromkeys(of.rule for of in found)
+    told = [f"the run's verdict is look ({', '.join(rules)})"] * bool(rules)
+    if share >= _OFTEN_DOUBTED:
+        median = np.median(obj.confidence[obj.has_pose])
+        told.append(f"{100 * share:.0f} % of the run's poses are doubted (median confidence {median:.2f})")
+    if not told:
         return ""
-    median = np.median(obj.confidence[obj.has_pose])
-    doubted = f"{100 * share:.0f} % of the run's poses are doubted (median confidence {median:.2f})"
-    return f"{doubted}, parts of it may be doubled or out of place: p2p eval says where to look; "
+    return f"{', '.join(told)}: parts of it may be doubled or out of place: p2p eval says where to look; "
 
 
 def lacks(off_model: float) -> str:

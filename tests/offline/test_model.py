@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import cv2
@@ -346,6 +347,7 @@ def test_a_model_that_lacks_a_part_is_told(finished):
     for off_px, exact in ((4, True), (8, False)):
         masks = {int(i): {"box": grown(made.masks(int(i))["box"], off_px)} for i in made.frames[::4]}
         wide = SimpleNamespace(frames=made.frames, run=made.run, masks=masks.get, exact_masks=exact)
+        wide.beside = partial(Finished.beside, wide)
         render = Renderer(whole.vertices, whole.faces, made.sequence.camera)
         assert model.beside(wide, "box", np.arange(0, len(made.frames), 4), render) == 0
     assert model.lacks(shares[0]) == "" and "lacks a part" in model.lacks(shares[2])
@@ -355,8 +357,21 @@ def test_a_model_that_lacks_a_part_is_told(finished):
 def test_a_model_of_doubted_poses_says_so_first(finished, share, says):
     obj = load_run(finished).objects["box"]
     obj = obj.select(obj.has_pose)
-    said = model.often_doubted(replace(obj, confidence=np.where(np.arange(len(obj)) < share * len(obj), 0.3, 0.9)))
+    doubted = replace(obj, confidence=np.where(np.arange(len(obj)) < share * len(obj), 0.3, 0.9))
+    said = model.suspect(doubted, [])
     assert bool(said) == bool(says) and said.startswith(says) and ("(median confidence 0.30)" in said) == bool(says)
+
+
+def test_a_model_has_the_verdict_of_its_run(finished, tmp_path):
+    """As ``p2p eval`` gives it: of its own doubts, of what the images show, and of known sizes."""
+    info = json.loads((finished / "run.json").read_text())
+    doubts, options = [{"text": "clicks on 'box': flat", "object": "box", "kind": ""}], {"sizes": {"can": "90"}}
+    (finished / "run.json").write_text(json.dumps(info | {"doubts": doubts, "options": options}))
+    said = write_product(finished, "model", tmp_path / "models", faces=500)
+    of = {name: json.loads((tmp_path / "models" / name / "model.json").read_text()) for name in ("box", "can")}
+    assert [about["verdict"] for about in of.values()] == ["look", "look"]
+    assert of["box"]["look_at"] == ["clicks on 'box': flat"] and "known to be 90 cm" in of["can"]["look_at"][0]
+    assert "box: the run's verdict is look (start): parts" in said and "p2p eval says where to look" in said
 
 
 def test_a_surface_is_cleaned_of_what_no_object_has():
