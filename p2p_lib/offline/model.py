@@ -177,13 +177,12 @@ def suspect(obj: ObjectRun, found: Iterable[Suspicion]) -> str:
     found  what speaks against them by ``p2p eval``
     """
     share, rules = float(obj.doubted.sum() / obj.has_pose.sum()), dict.fromkeys(of.rule for of in found)
-    told = [f"the run's verdict is look ({', '.join(rules)})"] * bool(rules)
-    if share >= _OFTEN_DOUBTED:
-        median = np.median(obj.confidence[obj.has_pose])
-        told.append(f"{100 * share:.0f} % of the run's poses are doubted (median confidence {median:.2f})")
-    if not told:
-        return ""
-    return f"{', '.join(told)}: parts of it may be doubled or out of place: p2p eval says where to look; "
+    told = f"the run's verdict is look ({', '.join(rules)}): p2p eval says why; " * bool(rules)
+    if share < _OFTEN_DOUBTED:
+        return told
+    median = np.median(obj.confidence[obj.has_pose])
+    doubted = f"{100 * share:.0f} % of the run's poses are doubted (median confidence {median:.2f})"
+    return f"{told}{doubted}, parts of it may be doubled or out of place: p2p eval says where to look; "
 
 
 def lacks(off_model: float) -> str:

@@ -371,7 +371,7 @@ def test_a_model_has_the_verdict_of_its_run(finished, tmp_path):
     of = {name: json.loads((tmp_path / "models" / name / "model.json").read_text()) for name in ("box", "can")}
     assert [about["verdict"] for about in of.values()] == ["look", "look"]
     assert of["box"]["look_at"] == ["clicks on 'box': flat"] and "known to be 90 cm" in of["can"]["look_at"][0]
-    assert "box: the run's verdict is look (start): parts" in said and "p2p eval says where to look" in said
+    assert "box: the run's verdict is look (start): p2p eval says why" in said
 
 
 def test_a_surface_is_cleaned_of_what_no_object_has():
