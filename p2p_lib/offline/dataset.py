@@ -47,8 +47,8 @@ COLUMNS = (
     "doubtful",
 )
 #: If more than this share of an object's labels lies beside its masks, the median over its images, its model is larger
-#: than it. (A keyboard with a strip of its table, a roll of tape, a mug of which masks missed a part: 4.6 to 7 %; ten
-#: others of seven runs: at most 3.4 %.)
+#: than it. (A keyboard with a strip of its table, a roll of tape, a mug of which masks missed a part: 4.6 to 7 %; nine
+#: others of five runs: at most 3.4 %.)
 BESIDE = 0.04
 #: The one rule of which labels are to be looked at. Not by ``depth_off_mm``: a tenth of a surface on the background, as
 #: a fringe of it, is decimetres off.
