@@ -158,7 +158,7 @@ def check_folder(
         said = [of.message for of in doubts if isinstance(of.message, Doubt) and of.message.object == name]
         findings += [Finding(f"{name}: clicks", Level.LOOK, str(doubt)) for doubt in said]
         findings += [_rim(name, [(frame, mask), *others], config), _points(name, frame, mask, config)]
-        findings += _misspelt(name, firsts)
+        findings += [*_misspelt(name, firsts), *_later(name, frame, prompts)]
     return findings if unit is None else _blamed(unit, findings)
 
 
@@ -280,6 +280,14 @@ def _files(folder: Path) -> list[Finding]:
     for path in (path for path in (folder / "times.txt", folder / "depth_scale.txt") if path.exists()):
         look(path.name, "It is optional: correct it or remove it.", partial(images.read_numbers, path, "numbers"))
     return wrong
+
+
+def _later(name: str, first: Frame, prompts: Iterable[Prompt]) -> list[Finding]:
+    """That corrections are not looked at: what they make of a mask depends on how the object was followed."""
+    later = sorted({prompt.frame for prompt in prompts if prompt.name == name and prompt.frame > first.index})
+    text = f"in {len(later)} later frames, from frame {later[0]} on, not looked at here" if later else ""
+    fix = "p2p run draws the masks that they make into its first_masks.png."
+    return [Finding(f"{name}: corrections", Level.OPTIONAL, text, fix)] if later else []
 
 
 def _camera(camera: Camera) -> Finding:

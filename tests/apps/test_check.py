@@ -340,6 +340,14 @@ def test_clicks_of_two_objects_on_one_body_are_worth_a_look(good):
     assert finding.level is Level.LOOK and "selects most of 'box', too" in finding.text
 
 
+def test_corrections_are_said_not_to_be_looked_at(good):
+    (box,) = prompts_in({"box": open_sequence(good).masks(0)["box"]})
+    later = [replace(box, frame=4), replace(box, frame=2)]
+    finding = found(good, "box: corrections", prompts=[box, *later])
+    assert finding.level is Level.OPTIONAL and "in 2 later frames, from frame 2 on, not looked at" in finding.text
+    assert not [f for f in check_folder(good, prompts=[box]) if "corrections" in f.name]
+
+
 def test_a_click_that_segments_nothing_is_said_once(good, recwarn):
     (wrong,) = alarms(check_folder(good, **click(5, 5)))
     assert (wrong.name, wrong.level) == (
