@@ -92,6 +92,7 @@ class Remembered(TwoMaps):
         self._finds: list[tuple[float, np.ndarray | None]] = []  # the newest looks, until two agree: time_s, T_cam_obj
         self._claimed, self._borne_out = False, 0  # whether it is said to be there; frames whose points agreed
         self._bare, self._in_vain = True, 0  # whether few points agree; looks in a row that did not find it
+        self.left: np.ndarray | None = None  # T_cam_obj of a moment ago, where a tracker goes on after a restart
 
     @property
     def recalls(self) -> bool:
@@ -131,6 +132,7 @@ class Remembered(TwoMaps):
         found = self._look(frame, mask, taken)
         T = None if found is None else found.sighting.T_cam_obj
         before = [(self.life.seen_s, self.life.T_cam_obj)] if self.life.has_pose else self._finds
+        before, self.left = before if self.left is None else [(frame.time_s, self.left)], None
         alike = (T is not None and self._alike(T, other, frame.time_s - time_s) for time_s, other in before)
         again = found is not None and (mask is not None or any(alike))
         self._finds = [] if again or self.life.has_pose else [*self._finds, (frame.time_s, T)][-_LOOKS:]
@@ -186,6 +188,9 @@ class Remembered(TwoMaps):
     ) -> list[tuple[Sighting, bool]]:
         """Where it may be, and whether by agreeing landmarks (True) or by shape and colour alone."""
         p_obj, sample = self._memory.p_obj, self.policy.shape.sample(self.model)
+        there = None if self.left is None else search.about(self.left, sample)
+        if there is not None and there.share >= _RECOGNISED:
+            return [(there, True)]
         pairs = self._recogniser.pairs(frame, self._memory.descriptors)
         if recognised := self._recognised(search, pairs):
             return [(sighting, True) for sighting in recognised]

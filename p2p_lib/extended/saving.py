@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from p2p_lib import __version__
+from p2p_lib.core import se3
 from p2p_lib.core.camera import Camera
 from p2p_lib.core.config import from_dict
 from p2p_lib.core.errors import BadInput, in_a_line
@@ -61,14 +62,18 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
             frozen = {name: isinstance(obj, Remembered) and obj.frozen for name, obj in self.objects.items()}
             given = dict(zip(_PARTS, self._made_of[2:], strict=True))
             parts = {kind: part if isinstance(part, str) else [type(part).__name__] for kind, part in given.items()}
+            lives = {name: obj.life for name, obj in self.objects.items()}
+            poses = {n: T.tolist() for n, of in lives.items() if (T := of.T_cam_obj) is not None and of.has_pose}
             about: dict[str, Any] = {"camera": asdict(self.camera), "config": self.config.as_dict(), "objects": frozen}
             kept = learnt.keys() | self._earlier.keys()
             waiting = [as_entry(prompt) for name, prompt in self._prompts.items() if name not in kept]
-            save_memories(path, learnt, _SAVED, about | {"prompts": waiting, **parts})
+            save_memories(path, learnt, _SAVED, about | {"poses": poses, "prompts": waiting, **parts})
 
     @classmethod
     def load(cls, path: str | Path, camera: Camera | None = None, **parts: Any) -> Self:
         """A tracker that knows what another one knew when it was saved; its objects are looked for, and found, anew.
+
+        In the first frame each is looked for where it was in the newest before, if it was followed then.
 
         camera  if it is another one now; ``parts``: a ``tracker``, ``detector`` or ``segmenter`` in place of the saved
                 one, needed where that was given as an instance
@@ -86,6 +91,7 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
             camera = Camera(**about["camera"]) if camera is None else camera
             config = from_dict(about["config"], str(path))
             frozen = {name: bool(is_frozen) for name, is_frozen in about["objects"].items()}
+            left = {name: se3.check("pose", T) for name, T in about.get("poses", {}).items()}
         except (KeyError, TypeError, AttributeError):
             lacking = "a file that does not say with what camera, parameters, parts and objects"
             raise BadInput(str(path), lacking, _SAVED_BY) from None
@@ -97,6 +103,8 @@ class Savable(pipeline.Point2Pose[TwoMaps]):
         loaded: Any = cls(camera, config, **(saved | parts))
         for name, is_frozen in frozen.items():
             loaded.add_object(name, memory=learnt.get(name), frozen=is_frozen)
+            if name in left:
+                loaded.objects[name].left = left[name]
         for prompt in parse_prompts({"objects": waiting}) if (waiting := about.get("prompts")) else ():
             loaded.tell(prompt)
         return loaded

@@ -20,7 +20,7 @@ from p2p_lib.core.types import Status
 from p2p_lib.datasets.resized import Resized
 from p2p_lib.extended.graph import BoundedGraph
 from p2p_lib.extended.image_search import ImageSearch, Sighting
-from p2p_lib.extended.remembered import _certain
+from p2p_lib.extended.remembered import Remembered, _certain
 from p2p_lib.extended.remembering import _outline, memory_of
 from p2p_lib.method.tsdf import TsdfVolume
 from p2p_lib.trackers.builtin.recogniser import Recognised, Recogniser
@@ -539,13 +539,31 @@ def test_a_tracker_survives_a_restart(crossing, learnt, tmp_path):
     loaded = Point2Pose.load(tmp_path / "tracker.npz")
     assert loaded.config == learnt.method.config and loaded.camera == crossing.camera
     again = range(LEARNT[-1] + 1, LEARNT[-1] + 5)
-    *_, told = followed(crossing, loaded, again)
+    at_once, *_, told = followed(crossing, loaded, again)
+    assert at_once["box"].T_cam_obj is not None, "it is looked for where it was"
     *_, goes_on = followed(crossing, learnt.method, again)
     off = se3.inverse(goes_on["box"].T_cam_obj) @ told["box"].T_cam_obj
     assert np.linalg.norm(off[:3, 3]) < 0.004 and np.degrees(se3.angle_rad(off)) < 2
     with pytest.raises(BadInput, match=r"tracker\.save"):
         save_memory(tmp_path / "box.npz", learnt.memory)
         Point2Pose.load(tmp_path / "box.npz")
+
+
+def test_where_it_was_before_a_restart_its_shape_tells(crossing, learnt, tmp_path, monkeypatch):
+    """As of a mug, of which few landmarks show."""
+    learnt.method.save(tmp_path / "tracker.npz")
+    monkeypatch.setattr(Remembered, "_recognised", lambda *_: [])
+    monkeypatch.setattr(ImageSearch, "among", lambda *_: [])
+    (told,) = followed(crossing, Point2Pose.load(tmp_path / "tracker.npz"), [LEARNT[-1] + 1])
+    assert told["box"].T_cam_obj is not None
+
+
+def test_what_is_elsewhere_after_a_restart_is_looked_for_as_any(crossing, learnt, tmp_path):
+    learnt.method.save(tmp_path / "tracker.npz")
+    loaded = Point2Pose.load(tmp_path / "tracker.npz")
+    loaded.objects["box"].left = se3.from_rt(np.eye(3), np.array([0.3, 0.0, 0.0])) @ loaded.objects["box"].left
+    first, *_, told = followed(crossing, loaded, LATER[:4])
+    assert first["box"].T_cam_obj is None and told["box"].T_cam_obj is not None
 
 
 def test_what_is_frozen_is_so_after_a_restart_and_what_is_not_found_yet_is_looked_for(crossing, learnt, tmp_path):
