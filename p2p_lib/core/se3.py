@@ -17,6 +17,8 @@ import numpy as np
 
 from p2p_lib.core.errors import BadInput
 
+#: A rotation that is off by less may have been written with too few decimals.
+_ROUNDED = 0.01
 IDENTITY = np.eye(4)
 IDENTITY.setflags(write=False)
 
@@ -155,10 +157,11 @@ def check(name: str, T: np.ndarray, tolerance: float = 1e-4) -> np.ndarray:
     if not np.isfinite(T).all():
         raise BadInput(name, "NaN or infinite entries", "a finite 4x4 transformation")
     R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > tolerance or np.linalg.det(R) < 0:
-        scale = np.cbrt(np.linalg.det(R))
-        got = f"a matrix that is not a rotation (it scales by {scale:.3g})"
-        raise BadInput(name, got, "an orthonormal, right-handed 3x3 block")
+    off, det = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
+    if off > tolerance or det < 0:
+        got = f"a matrix that is not a rotation (R R^T is off by {off:.2g}; it scales by {np.cbrt(det):.5g})"
+        fix = "Of rounded numbers: write more decimals, or U V^T of the SVD of R." if det > 0 and off < _ROUNDED else ""
+        raise BadInput(name, got, f"an orthonormal, right-handed 3x3 block, to {tolerance:g}", fix)
     if np.abs(T[3] - IDENTITY[3]).max() > tolerance:
         raise BadInput(name, f"last row {T[3].tolist()}", "0 0 0 1")
     return T

@@ -44,6 +44,7 @@ MAPPED = 0.1
 _UNCONSTRAINED = "rotation not constrained by shape or texture"
 #: The reason of a pose of little confidence although nothing contradicts it.
 _UNTOLD = "its turn is not told yet from others that look alike"
+_HARDLY = "hardly any point of a sure pose agrees with it"
 #: A keypoint that has agreed with so many poses has its whole vote.
 _WHOLE_VOTE = 3
 
@@ -330,8 +331,8 @@ class OurPolicy(Policy[OurObservation, OurKnown]):
         )
         if not verdict.doubted and not belief.constrained and verdict.status is Status.TRACKED:
             verdict = replace(verdict, status=Status.DEGRADED, reason=_UNCONSTRAINED)
-        if life.doubted and not verdict.reason:
-            verdict = replace(verdict, reason=_UNTOLD)
+        if confidence <= DOUBTED and not verdict.reason:
+            verdict = replace(verdict, reason=_UNTOLD if life.doubted else _HARDLY)
         return BelievedAdmission(verdict, best.hypothesis.inliers, belief.of_frame, confidence, **kept)
 
     def request(self, obs: OurObservation, known: OurKnown, best: Candidate, admission: Admission) -> Requests:

@@ -274,6 +274,7 @@ def bad(change) -> np.ndarray:
         (bad(lambda T: T.__setitem__((0, 3), np.nan)), "NaN"),
         (bad(lambda T: T.__setitem__((2, 1), np.inf)), "infinite"),
         (bad(lambda T: T.__imul__(1.01)), "not a rotation"),
+        (np.round(se3.exp(tangents(())), 3), r"R R\^T is off by .* to 0\.0001\. .*more decimals"),
         (np.diag([1.0, 1, -1, 1]), "not a rotation.*right-handed"),
         (np.zeros((4, 4)), "not a rotation"),
         (bad(lambda T: T.__setitem__(3, [0, 0, 0, 2])), "last row.*0 0 0 1"),

@@ -409,6 +409,29 @@ def test_a_side_that_comes_into_view_is_of_the_object():
     assert iou(found, card(at) | side) > 0.9 and found[side].mean() > 0.8
 
 
+@pytest.mark.parametrize("over_px", [0, 12])
+@pytest.mark.parametrize("corrected", ["clicks", "box", "elsewhere"])
+def test_what_a_correction_has_taken_from_the_mask_stays_out_when_it_comes_back(corrected, over_px):
+    """As a hand: without the correction it is a side that comes into view. Of another place nothing is denied."""
+    at, follow = (120, 80), segmenter()
+    side = np.roll(card(at), 60, 1) & (np.arange(320) < 190)
+    (clicks,) = on(card=at)
+    correction = {
+        "clicks": [Prompt("card", points_px=clicks.points_px, negative_px=[[185, 90], [185, 105], [185, 120]])],
+        "box": [Prompt("card", box_px=[118, 78, 180, 131])],
+        "elsewhere": [Prompt("card", points_px=[[20, 200], [30, 210], [40, 205]])],
+    }[corrected]
+    prompts = {0: [clicks], 5: correction}
+    for k in range(14):
+        frame, hand = picture(k, [(at, 1), ((10, 180), 3)]), np.roll(side, -over_px if k > 8 else 0, 1)
+        if 0 < k < 6 or k > 8:
+            frame.rgb[hand], frame.depth_m[hand] = (200, 40, 200), frame.depth_m[card(at)].mean()
+        found = follow.segment(frame, prompts.get(k, ())) == 1
+        assert k != 4 or found[hand].mean() > 0.8
+    assert (follow._targets["card"].denied is None) == (corrected == "elsewhere")
+    assert corrected == "elsewhere" or (found[hand].mean() < 0.05 and iou(found, card(at) & ~hand) > 0.9)
+
+
 @pytest.mark.parametrize("on_surface", [True, False])
 def test_a_side_as_plain_as_the_wall_is_of_the_object_where_its_surface_is(on_surface):
     """By its colours it is the wall, which is beside it and in the same depth; what is reconstructed tells better."""

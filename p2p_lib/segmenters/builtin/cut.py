@@ -125,6 +125,13 @@ def by_colour(patch: Patch, own: np.ndarray, outside: np.ndarray, config: Segmen
     return config.colour_weight * evidence(own, histogram(patch.codes[outside]))[patch.codes]
 
 
+def by_denial(patch: Patch, own: np.ndarray, denied: np.ndarray | None, config: SegmentationConfig) -> np.ndarray:
+    """(h, w) log-odds, 0 at most, of colours ``denied`` (4096,) that a user has taken from the mask; None: of none."""
+    if denied is None:
+        return np.zeros(patch.shape, np.float32)
+    return config.colour_weight * np.minimum(evidence(own, denied), 0)[patch.codes]
+
+
 def strange(patch: Patch, mask: np.ndarray, own: np.ndarray) -> bool:
     """Whether a mask (h, w) bool has the colours of the rest of the patch, not the object's ``own`` (4096,)."""
     if mask.all() or not mask.any():

@@ -9,7 +9,7 @@ import numpy as np
 
 from p2p_lib.core.image import in_mask
 from p2p_lib.core.interfaces import Hint
-from p2p_lib.segmenters.builtin.cut import by_colour, by_geometry, by_surface, cut, strange, warped
+from p2p_lib.segmenters.builtin.cut import by_colour, by_denial, by_geometry, by_surface, cut, strange, warped
 from p2p_lib.segmenters.builtin.motion import free_before, scene_stays
 from p2p_lib.segmenters.builtin.patch import Box, Patch, around, dilated, keep_seeded_components, support_plane
 from p2p_lib.segmenters.builtin.prompted import ROOM_PX
@@ -94,7 +94,8 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
     beside = predicted.beside & (surface <= 0) if known else None
     # Against what was beside it a frame ago: a side that comes into view may have colours that it has not shown yet.
     colour = by_colour(patch, target.colours, predicted.beside & (prior < 0.2), cfg)
-    other = (surface <= 0) & (colour < -_OTHER * cfg.colour_weight)
+    denied = by_denial(patch, target.colours, target.denied, cfg)
+    other = (surface <= 0) & (np.minimum(colour, denied) < -_OTHER * cfg.colour_weight)
     log_odds, component = by_geometry(patch, core, plane, cfg, motions, beside, free, other)
     stays = cfg.prior_weight * np.where(foreign | predicted.shown, 0, 2 * prior - 1)
     stays[patch.depth_m == 0] /= 2  # where nothing is measured, colours shall count as much
@@ -102,6 +103,7 @@ def follow(view: View, target: Target, hint: Hint, others: Sequence[Hint], predi
     log_odds += np.where(component, np.maximum(stays, 0), stays)
     log_odds[foreign] -= cfg.geometry_weight
     log_odds += by_colour(patch, target.colours, (prior < 0.2) & (~component | predicted.beside), cfg) + surface
+    log_odds += denied
     x = keep_seeded_components(cut(patch, log_odds, start=prior), core)
     adjacent = dilated((x > 0.5) & (patch.depth_m > 0), 1)
     x = np.where((patch.depth_m > 0) | (prior > 0.5) | adjacent, x, 0)

@@ -164,7 +164,10 @@ class BuiltinSegmenter:
         if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             self.doubts[cutter.prompt.name] = doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
-        return Target(), (box, x)  # its colours and its size are learnt anew
+        kept = np.zeros(view.frame.shape, bool)
+        _mark(kept, (box, x))
+        taken = was & ~kept & (effect is not Effect.BEGUN_ELSEWHERE)
+        return target.anew(view.frame, taken), (box, x)
 
     def _cut_out(
         self,

@@ -44,6 +44,7 @@ class Target:
     confident  whether enough points agreed on its pose when it was cut out last
     proven     whether its points were ever on it since it was found; found by colours alone it may be something else
     bystanders what was beside it when it vanished; None while it is seen, and where nobody expects it
+    denied     (4096,) histogram of the colours that corrections have taken from its mask; None before any
     given      the newest frame with a mask that was given and not empty. It is learnt from only when needed, which it
                never is where every frame brings a mask
     """
@@ -56,11 +57,19 @@ class Target:
     confident: bool = False
     proven: bool = True
     bystanders: Bystanders | None = None
+    denied: np.ndarray | None = None
     given: tuple[Frame, np.ndarray] | None = None
 
     def with_given(self, frame: Frame, mask: np.ndarray) -> Target:
         """With a mask (H, W) bool that was given: an empty one says that the object is hidden."""
         return replace(self, seen=None, given=(frame, mask) if mask.any() else self.given)
+
+    def anew(self, frame: Frame, taken: np.ndarray) -> Target:
+        """Of a correction that has ``taken`` pixels (H, W) bool from its mask: all else is learnt anew."""
+        if not taken.any():
+            return Target(denied=self.denied)
+        denied = histogram(colour_codes(frame.rgb[taken]))
+        return Target(denied=denied if self.denied is None else (self.denied + denied) / 2)
 
     def with_learnt(self, previous: Frame | None, focal_px: np.ndarray, config: SegmentationConfig) -> Target:
         """With colours and size updated from the last given mask."""
