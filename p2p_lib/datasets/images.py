@@ -33,7 +33,7 @@ SEE_CHECK = "p2p check FOLDER says what else is missing."
 #: What layouts call the folder of colour images.
 COLOUR_FOLDERS = ("rgb", "color")
 #: What recorders call a folder of images.
-_IMAGES = "([-_]?(images?|maps?|frames?|png|raw|aligned|registered))?"
+_IMAGES = "([-_]?(images?|maps?|frames?|png|raw|mm|aligned|registered))?"
 _LIKELY = {
     "rgb": f"(rgb|colou?rs?|images?|frames?){_IMAGES}",
     "depth": f"((aligned|registered)[-_]?)?depths?{_IMAGES}",

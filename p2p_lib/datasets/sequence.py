@@ -307,9 +307,11 @@ def recognise(folder: Path) -> str:
     if layout := _layout(folder):
         return layout
     holds = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())[:8]) or "nothing"
-    if not (folder / "rgb").is_dir() and ((folder / "depth").is_dir() or (folder / "cam_K.txt").is_file()):
-        fix = "rgb/ is missing: put the colour images there, one for each depth image."
-        fix = called_otherwise(folder / "rgb") or fix
+    parts = [folder / part for part in ("rgb", "depth")]
+    renamed = [fix for part in parts if not part.is_dir() and (fix := called_otherwise(part))]
+    own = not parts[0].is_dir() and (parts[1].is_dir() or (folder / "cam_K.txt").is_file())
+    if own or len(renamed) == len(parts):
+        fix = " ".join(renamed) or "rgb/ is missing: put the colour images there, one for each depth image."
         raise BadInput(str(folder), f"a folder with {holds}", "rgb/, depth/ and cam_K.txt", fix)
     fix = f"Name the layout with --format ({', '.join(FORMATS)})."
     if _layout(folder.parent):

@@ -222,6 +222,12 @@ def test_a_folder_of_another_name_is_to_be_renamed(sequence, mine, ours):
     assert_named(sequence, f"Rename {mine}/ to {ours}/")
 
 
+def test_both_folders_of_other_names_are_to_be_renamed(tmp_path):
+    for name in ("images", "depth_mm"):
+        (tmp_path / name).mkdir()
+    assert_named(tmp_path, r"Rename images/ to rgb/\. Rename depth_mm/ to depth/\.")
+
+
 def test_a_picture_cut_off_is_named(sequence):
     path = sequence / "rgb/0002.png"
     path.write_bytes(path.read_bytes()[:-20])
