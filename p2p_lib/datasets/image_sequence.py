@@ -26,7 +26,7 @@ from p2p_lib.datasets.truth import ObjectTruth
 _DIGITS = 16
 #: What to do without a camera matrix.
 WRITE_K = (
-    "Write fx 0 cx / 0 fy cy / 0 0 1 into cam_K.txt, in pixels at the size of the images, as the camera's driver gives "
+    "Write fx 0 cx 0 fy cy 0 0 1 into cam_K.txt, in pixels at the size of the images, as the camera's driver gives "
     "them; without it camera_intrinsic.json of Open3D's recorder is read."
 )
 #: Files in which somebody may have put it instead, and those that hold something else.
@@ -251,9 +251,7 @@ def write_K(folder: Path) -> str:
         if said := _as_K(numbers):
             return f"{path.name} holds four numbers. {said}"
         if numbers.size == 9:
-            return (
-                f"{path.name} holds nine numbers: if they are the matrix fx 0 cx / 0 fy cy / 0 0 1, call it cam_K.txt."
-            )
+            return f"{path.name} holds nine numbers: if they are the matrix fx 0 cx 0 fy cy 0 0 1, call it cam_K.txt."
     likely = [path.name for path in others if re.search(_LIKELY, path.name.lower())]
     may = f" {listed(likely, 3)} may hold them." if likely else ""
     return f"{WRITE_K}{may}"
@@ -264,4 +262,4 @@ def _as_K(numbers: np.ndarray) -> str:
     if numbers.size != 4 or not np.isfinite(numbers).all():
         return ""
     fx, fy, cx, cy = numbers.ravel()
-    return f"If these are fx fy cx cy, write {fx:.9g} 0 {cx:.9g} / 0 {fy:.9g} {cy:.9g} / 0 0 1 into cam_K.txt."
+    return f"If these are fx fy cx cy, write {fx:.9g} 0 {cx:.9g} 0 {fy:.9g} {cy:.9g} 0 0 1 into cam_K.txt."

@@ -782,7 +782,7 @@ def test_open3ds_layout_without_its_files_says_at_once_how_to_make_a_folder_of_o
     (folder / "intrinsics.txt").write_text("525 524 319.5 239.5\n")
     (folder / "notes.txt").write_text("a mug\n")
     (wrong,) = check_folder(folder)
-    K = "525 0 319.5 / 0 524 239.5 / 0 0 1"
+    K = "525 0 319.5 0 524 239.5 0 0 1"
     assert "no camera_intrinsic.json or intrinsic.json" in wrong.text
     assert wrong.fix == (
         "If it is of another layout, name that with --format; if it is a folder of your own, rename color/ to rgb/ "

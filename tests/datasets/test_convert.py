@@ -88,7 +88,7 @@ def test_tum_pairs_images_by_time(tmp_path):
 def test_tum_knows_its_own_cameras_by_the_folders_name(tmp_path):
     sequence = open_sequence(tum(tmp_path / "rgbd_dataset_freiburg2_desk", K_file=False))
     assert (sequence.camera.fx, sequence.camera.cy) == (520.9, 249.7)
-    with pytest.raises(MissingData, match=r"cam_K\.txt: no such file, .*\. Write fx 0 cx / 0 fy cy / 0 0 1 into cam_K"):
+    with pytest.raises(MissingData, match=r"cam_K\.txt: no such file, .*\. Write fx 0 cx 0 fy cy 0 0 1 into cam_K"):
         open_sequence(tum(tmp_path / "mine", K_file=False))
 
 
