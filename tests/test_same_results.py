@@ -17,6 +17,11 @@ def test_one_bit_makes_a_difference(same, tmp_path):
         np.savez(tmp_path / side / "poses.npz", **{"box/T": np.array([value, np.nan]), "box/status": np.array(["x"])})
     assert same.differences(tmp_path / "a", tmp_path / "b") == []
     assert same.differences(tmp_path / "a", tmp_path / "c") == ["poses.npz: box/T"]
+    for side in "ab":
+        np.savez(
+            tmp_path / side / "poses.npz", **{"box/T": np.zeros(1), "box/reason": np.array([f"as {side} says it"])}
+        )
+    assert same.differences(tmp_path / "a", tmp_path / "b") == [], "words are in no table"
     np.savez(tmp_path / "b" / "masks.npz", box=np.zeros(2))
     assert same.differences(tmp_path / "a", tmp_path / "b") == ["masks.npz: box"], "one of them alone has it"
 

@@ -4,8 +4,8 @@
 
 For a change that decides no pose: names, types, messages, what is kept and shown; or none but of runs from clicks. Runs
 of both presets, of 2D trackers that need no weights, of every source of masks and of some faults are made with the
-library of COMMIT and with this one, and every array of their poses, keypoints and masks is compared. Where all are the
-same, tables and figures whose note has the digest of COMMIT's code get this code's, and ``same_as``: the digest that
+library of COMMIT and with this one, and every array of their poses, keypoints and masks is compared, but words. Where all are
+the same, tables and figures whose note has the digest of COMMIT's code get this code's, and ``same_as``: the digest that
 they were made with, and how many runs were compared. Where runs from clicks alone differ, those get it whose plan has
 none. Ends with exit code 1 where another run differs; then nothing is written. Sequences below ``$P2P_DATA`` are
 compared where they are there. Where a bundled sequence is another film than it was, its runs tell nothing, and plans
@@ -62,6 +62,8 @@ FAULTS = (
 #: What makes a run start from clicks.
 CLICKS = ("clicks", "--prompts")
 ARRAYS = ("poses.npz", "keypoints.npz", "masks.npz")
+#: What of these is told to people, and in no table.
+WORDS = "/reason"
 #: Of the library that is imported: prints its digest; is its command line.
 _DIGEST = "from p2p_lib.datasets.provenance import code_digest; print(code_digest())"
 #: Prints the digest of some of a sequence's images and of its truth.
@@ -102,11 +104,11 @@ def python(library: Path, *arguments: str) -> str:
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """Arrays of two runs that are not the same to the last bit."""
+    """Arrays of two runs that are not the same to the last bit, but for words."""
     found = []
     for name in ARRAYS:
         kept = [dict(np.load(folder / name)) if (folder / name).is_file() else {} for folder in (one, other)]
-        for key in sorted({*kept[0], *kept[1]}):
+        for key in sorted(key for key in {*kept[0], *kept[1]} if not key.endswith(WORDS)):
             a, b = (arrays.get(key) for arrays in kept)
             if a is None or b is None or a.dtype != b.dtype or a.tobytes() != b.tobytes():
                 found.append(f"{name}: {key}")
