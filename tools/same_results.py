@@ -4,12 +4,12 @@
 
 For a change that decides no pose: names, types, messages, what is kept and shown; or none but of runs from clicks. Runs
 of both presets, of 2D trackers that need no weights, of every source of masks and of some faults are made with the
-library of COMMIT and with this one, and every array of their poses, keypoints and masks is compared, but words. Where all are
-the same, tables and figures whose note has the digest of COMMIT's code get this code's, and ``same_as``: the digest that
-they were made with, and how many runs were compared. Where runs from clicks alone differ, those get it whose plan has
-none. Ends with exit code 1 where another run differs; then nothing is written. Sequences below ``$P2P_DATA`` are
-compared where they are there. Where a bundled sequence is another film than it was, its runs tell nothing, and plans
-with it stay of earlier code.
+library of COMMIT and with this one, and every array of their poses, keypoints and masks is compared, but words. Where
+all are the same, tables and figures whose note has the digest of COMMIT's code get this code's, and ``same_as``: the
+digest that they were made with, and how many runs were compared. Where runs from clicks alone differ, those get it
+whose plan has none. Ends with exit code 1 where another run differs; then nothing is written. Sequences below
+``$P2P_DATA`` are compared where they are there. Where a bundled sequence is another film than it was, its runs tell
+nothing, and plans with it stay of earlier code.
 """
 
 from __future__ import annotations
