@@ -1207,6 +1207,15 @@ def test_questions_change_nothing():
     np.testing.assert_array_equal(lump.see(turned(4)).estimate.T_cam_obj, other.see(turned(4)).estimate.T_cam_obj)
 
 
+def test_a_pose_of_little_confidence_says_so(monkeypatch):
+    lump = settled(begun(), [2, 4])
+    sure = lump.see(turned(4)).estimate
+    monkeypatch.setattr("p2p_lib.extended.confidence.confidence", lambda *_: 0.3)
+    step = lump.see(turned(4)).estimate
+    assert sure.confidence > 0.5 and not sure.reason
+    assert step.status is Status.TRACKED and step.confidence == 0.3 and "hardly any point" in step.reason
+
+
 def test_a_pose_that_is_doubted_for_its_turn_alone_says_so():
     lump = settled(begun(), range(2, 40, 2))
     assert lump.see(turned(40)).estimate.confidence > 0.5
