@@ -233,7 +233,7 @@ def read_K(folder: Path) -> tuple[np.ndarray, str, tuple[int, int] | None]:
     try:
         K = images.read_numbers(path, expected)
     except P2PError as error:
-        raise advised(error, WRITE_K if path.exists() else write_K(folder)) from None
+        raise advised(error, WRITE_K if path.exists() else intrinsics_advice(folder)) from None
     if K.size != 9:
         decimals = "A comma parts numbers: write decimals with a point, as 913.05."
         fix = decimals if K.size == 18 else _as_K(K) or WRITE_K
@@ -241,7 +241,7 @@ def read_K(folder: Path) -> tuple[np.ndarray, str, tuple[int, int] | None]:
     return K.reshape(3, 3), str(path), None
 
 
-def write_K(folder: Path) -> str:
+def intrinsics_advice(folder: Path) -> str:
     """What to do in a folder without a camera matrix, of which another text file there may hold the numbers."""
     others = [path for path in sorted(folder.glob("*")) if path.suffix.lower() in _TEXTS and path.name not in _NO_K]
     for path in others:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from p2p_lib.core.errors import MissingData
 from p2p_lib.datasets import images
-from p2p_lib.datasets.image_sequence import INTRINSICS, ImageSequence, camera_of, paired_images, write_K
+from p2p_lib.datasets.image_sequence import INTRINSICS, ImageSequence, camera_of, intrinsics_advice, paired_images
 
 
 def load(folder: Path, masks: str | Path | None) -> ImageSequence:
@@ -18,7 +18,7 @@ def load(folder: Path, masks: str | Path | None) -> ImageSequence:
     if not any((folder / name).is_file() for name in (*INTRINSICS, "cam_K.txt")):
         fix = (
             "If it is of another layout, name that with --format; if it is a folder of your own, rename color/ to rgb/ "
-            f"and write cam_K.txt. {write_K(folder)}"
+            f"and write cam_K.txt. {intrinsics_advice(folder)}"
         )
         raise MissingData(str(folder), f"no {' or '.join(INTRINSICS)}, as Open3D's layout (color/) has", fix)
     rgb, depth = paired_images(folder, "color")

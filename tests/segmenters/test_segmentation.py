@@ -410,7 +410,7 @@ def test_a_side_that_comes_into_view_is_of_the_object():
 
 
 @pytest.mark.parametrize("over_px", [0, 12])
-@pytest.mark.parametrize("corrected", ["clicks", "box", "elsewhere"])
+@pytest.mark.parametrize("corrected", ["clicks", "negative", "box", "elsewhere"])
 def test_what_a_correction_has_taken_from_the_mask_stays_out_when_it_comes_back(corrected, over_px):
     """As a hand: without the correction it is a side that comes into view. Of another place nothing is denied."""
     at, follow = (120, 80), segmenter()
@@ -418,6 +418,7 @@ def test_what_a_correction_has_taken_from_the_mask_stays_out_when_it_comes_back(
     (clicks,) = on(card=at)
     correction = {
         "clicks": [Prompt("card", points_px=clicks.points_px, negative_px=[[185, 90], [185, 105], [185, 120]])],
+        "negative": [Prompt("card", negative_px=[[185, 90], [185, 105], [185, 120]])],
         "box": [Prompt("card", box_px=[118, 78, 180, 131])],
         "elsewhere": [Prompt("card", points_px=[[20, 200], [30, 210], [40, 205]])],
     }[corrected]

@@ -158,16 +158,16 @@ class BuiltinSegmenter:
         was = np.zeros(view.frame.shape, bool)
         _mark(was, had[1])
         self._effects[cutter.prompt.name] = effect = cutter.effect(was)
-        if not cutter.prompt.starts:
-            return Target(), cutter.correct(was) if was.any() else None
+        starts = cutter.prompt.starts
+        if not (starts or was.any()):
+            return target.anew(view.frame, was), None
         box, x = cutter.correct(was) if effect is Effect.MENDED else cutter.start()
-        if was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
+        if starts and was.any() and seen_in(view.frame, x > 0.5, box, view.config.min_px) is None:
             self.doubts[cutter.prompt.name] = doubt_nothing(cutter, "It keeps the mask that it had.")
             return had
         kept = np.zeros(view.frame.shape, bool)
         _mark(kept, (box, x))
-        taken = was & ~kept & (effect is not Effect.BEGUN_ELSEWHERE)
-        return target.anew(view.frame, taken), (box, x)
+        return target.anew(view.frame, was & ~kept & (effect is not Effect.BEGUN_ELSEWHERE)), (box, x)
 
     def _cut_out(
         self,
