@@ -747,9 +747,10 @@ def test_a_folder_that_counts_from_1_is_renamed_and_nothing_taken_out(good, tmp_
     assert [path.stem for path in sorted((folder / part).iterdir())] == [f"{k:06d}" for k in range(6 - gone)]
 
 
-def test_images_that_are_missing_here_and_there_are_not_taken_for_a_count_from_1(good, tmp_path):
+@pytest.mark.parametrize("first", [0, 2])
+def test_images_that_are_missing_here_and_there_are_not_taken_for_a_count_from_1(good, tmp_path, first):
     folder = shutil.copytree(good, tmp_path / "gaps")
-    (folder / "rgb/000002.png").unlink()
+    (folder / f"rgb/00000{first}.png").unlink()
     (folder / "depth/000004.png").unlink()
     assert found(folder, "depth/").fix == "Take out what has no counterpart."
 

@@ -324,6 +324,27 @@ def test_each_object_keeps_its_colour_in_the_film():
     assert (alone[masks["mug"]] == 0).all() and (both[50, 20] != both[50, 60]).any()
 
 
+def test_a_correction_that_is_refused_corrects_no_mask(folder, tmp_path):
+    """No depth was measured there: the object keeps the mask that it had."""
+    sequence, said = open_sequence(folder), list(PROMPTS)
+    method, drawn = Point2Pose(sequence.camera, preset("default").with_values(SETTINGS)), []
+    method.tell(PROMPTS[0])
+    with RunWriter(tmp_path / "run", sequence, method.config, "builtin", "clicks") as writer:
+        keeper = Keeper(writer, method, prompts=said)
+        for k in range(3):
+            frame = sequence.frame(k)
+            if k == 2:
+                frame = replace(frame, depth_m=np.zeros_like(frame.depth_m))
+                said.append(replace(PROMPTS[0], frame=k))
+                method.tell(said[-1])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                estimates = method.step(frame)
+            drawn.append(keeper.add(frame, estimates))
+    assert method.refused and method.masks["board"].any()
+    assert drawn == [(["board"], []), ([], []), ([], [])]
+
+
 def test_an_object_that_is_added_again_before_the_next_frame_is_a_new_one(folder, tmp_path, caplog):
     """And no correction of the one that had its name."""
     caplog.set_level("INFO", "p2p_lib")

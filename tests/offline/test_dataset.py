@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from p2p_lib.core.mesh import save
 from p2p_lib.datasets.exchange import FORMATS
 from p2p_lib.datasets.models import MESHES, find_models, load_points
 from p2p_lib.offline.dataset import BESIDE, agreement, doubtful, visible
-from p2p_lib.offline.finished import Silhouette
+from p2p_lib.offline.finished import Finished, Silhouette
 from p2p_lib.offline.products import write_product
 from tests.fixtures.made_run import T_OBJ_MODEL
 
@@ -72,10 +73,21 @@ def test_a_model_that_holds_more_than_its_object_makes_its_labels_doubtful(finis
     rows = list(csv.DictReader((out / "labels.csv").open()))
     share = {name: np.median([float(r["beside_mask"]) for r in rows if r["object"] == name]) for name in ("box", "can")}
     assert share["can"] < 0.01 and share["box"] > BESIDE
-    assert {row["object"] for row in rows if row["doubtful"] == "True"} == {"box"}
+    assert all((row["doubtful"] == "True") == (row["object"] == "box") for row in rows)
     told = f"beside the masks lies {100 * share['box']:.1f} % of box, {100 * share['can']:.1f} % of can"
     assert f"{told}: the model of box holds more than the object" in said
     assert json.loads((out / "labels.json").read_text())["beside_masks"] == pytest.approx(share, abs=1e-4)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_fringe_is_no_part_that_lies_beside(exact):
+    """Nor what coarse masks lack; a strip is."""
+    shown, mask = np.zeros((2, 200, 200), bool)
+    shown[50:150, 40:160], mask[50:150, 50:150] = True, True
+    made = SimpleNamespace(exact_masks=exact)
+    assert Finished.beside(made, shown, mask) == pytest.approx((2 * 4 * 100 if exact else 0) / 12000)
+    assert Finished.beside(made, shown[:, :147], mask[:, :147]) == pytest.approx((4 * 100 if exact else 0) / 10700)
+    assert np.isnan(Finished.beside(made, shown & False, mask))
 
 
 def test_holes_and_hands_make_no_label_doubtful():
